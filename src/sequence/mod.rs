@@ -1,0 +1,176 @@
+//! Recorded sequences: what a frame is, and one file per dataset layout that lists and reads them.
+//!
+//! Adding a layout takes one file and one row in [`Layout`].
+
+mod cameras;
+mod rectify;
+mod tum;
+
+use std::path::{Path, PathBuf};
+
+use image::RgbImage;
+use serde::{Deserialize, Serialize};
+
+use crate::geometry::{Camera, Trajectory, TrajectoryError};
+
+pub use rectify::{RectifiedImage, Rectifier};
+
+/// How a dataset lays out its files.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+pub enum Layout {
+    /// `rgb.txt`, `depth.txt`, `groundtruth.txt`, and `camera.txt` or a folder name that says which TUM camera it was.
+    Tum,
+}
+
+impl Layout {
+    pub const ALL: [Self; 1] = [Self::Tum];
+
+    /// The layout whose marker files are in `folder`.
+    fn recognise(folder: &Path) -> Option<Self> {
+        Self::ALL.into_iter().find(|layout| match layout {
+            Self::Tum => folder.join("rgb.txt").is_file(),
+        })
+    }
+}
+
+/// A depth image; 0 where the sensor measured nothing.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DepthImage {
+    pub width: u32,
+    pub height: u32,
+    /// Row-major `[height * width]`, metres along z.
+    pub metres: Vec<f32>,
+}
+
+impl DepthImage {
+    /// The depth at a pixel in metres, `None` where nothing was measured.
+    pub fn at(&self, x: u32, y: u32) -> Option<f32> {
+        let metres = self.metres[(y * self.width + x) as usize];
+        (metres > 0.0).then_some(metres)
+    }
+}
+
+/// One recorded frame as it was recorded: not undistorted, at full size.
+#[derive(Clone, Debug)]
+pub struct Frame {
+    /// Position in the sequence as replayed (after `--every` and `--frames`).
+    pub index: usize,
+    pub timestamp_s: f64,
+    pub color: RgbImage,
+    /// Registered to `color`, same size.
+    pub depth: Option<DepthImage>,
+}
+
+/// Where one frame lies on disk.
+#[derive(Clone, Debug, PartialEq)]
+pub struct FrameEntry {
+    pub timestamp_s: f64,
+    pub color: PathBuf,
+    pub depth: Option<PathBuf>,
+}
+
+/// A recording, opened and checked: its camera, the list of its frames, and the truth where there is one.
+#[derive(Clone, Debug)]
+pub struct Sequence {
+    pub name: String,
+    pub layout: Layout,
+    pub camera: Camera,
+    pub entries: Vec<FrameEntry>,
+    pub groundtruth: Option<Trajectory>,
+}
+
+#[derive(Debug, thiserror::Error)]
+pub enum SequenceError {
+    #[error("there is no folder {0}; give the folder that holds the recording")]
+    Missing(PathBuf),
+    #[error("{0} has no layout that we know ({known}); name one with --layout", known = Layout::ALL.map(|l| format!("{l:?}").to_lowercase()).join(", "))]
+    UnknownLayout(PathBuf),
+    #[error("cannot read {path}: {source}")]
+    Read { path: PathBuf, source: std::io::Error },
+    #[error("{path}:{line}: {what}")]
+    Syntax { path: PathBuf, line: usize, what: String },
+    #[error("{path} lists no frames; check that the recording was copied whole")]
+    Empty { path: PathBuf },
+    #[error("{list}:{line}: there is no file {image}; check that the recording was copied whole")]
+    MissingImage { list: PathBuf, line: usize, image: PathBuf },
+    #[error("{folder}: no camera.txt, and the folder's name says no known camera ({known}); add camera.txt with `fx fy cx cy width height depth_units_per_metre k1 k2 p1 p2`, or name one with --camera", known = cameras::names().join(", "))]
+    NoCamera { folder: PathBuf },
+    #[error("no camera is called `{name}`; known are {known}", known = cameras::names().join(", "))]
+    UnknownCamera { name: String },
+    #[error("{path} is {found_width}x{found_height}, but the camera is {width}x{height}; images, depth and camera must agree")]
+    Size { path: PathBuf, width: u32, height: u32, found_width: u32, found_height: u32 },
+    #[error("cannot decode {path}: {source}")]
+    Image { path: PathBuf, source: image::ImageError },
+    #[error("{path} is no 16-bit grey image; depth must be one")]
+    DepthFormat { path: PathBuf },
+    #[error("frames {start}..{end} is outside the sequence of {len} frames")]
+    Range { start: usize, end: usize, len: usize },
+    #[error(transparent)]
+    Groundtruth(#[from] TrajectoryError),
+}
+
+impl Sequence {
+    /// Opens a recording: finds its layout unless named, reads and checks its lists, camera and truth. No image is decoded.
+    /// `camera` names a preset (`tum-fr1`, …) to use instead of what the folder says.
+    pub fn open(folder: &Path, layout: Option<Layout>, camera: Option<&str>) -> Result<Self, SequenceError> {
+        if !folder.is_dir() {
+            return Err(SequenceError::Missing(folder.into()));
+        }
+        let layout = layout.or_else(|| Layout::recognise(folder)).ok_or_else(|| SequenceError::UnknownLayout(folder.into()))?;
+        match layout {
+            Layout::Tum => tum::open(folder, camera),
+        }
+    }
+
+    /// Keeps frames `start..end` (the end clipped to the sequence), then every `every`-th of these.
+    pub fn select(&mut self, range: Option<std::ops::Range<usize>>, every: usize) -> Result<(), SequenceError> {
+        let len = self.entries.len();
+        let range = range.unwrap_or(0..len);
+        if range.start >= range.end || range.start >= len {
+            return Err(SequenceError::Range { start: range.start, end: range.end, len });
+        }
+        let end = range.end.min(len);
+        self.entries = self.entries[range.start..end].iter().step_by(every.max(1)).cloned().collect();
+        Ok(())
+    }
+
+    /// Decodes frame `index`.
+    pub fn load(&self, index: usize) -> Result<Frame, SequenceError> {
+        let entry = &self.entries[index];
+        let color = decode(&entry.color)?.into_rgb8();
+        self.check_size(&entry.color, color.dimensions())?;
+        let depth = entry.depth.as_deref().map(|path| self.load_depth(path)).transpose()?;
+        Ok(Frame { index, timestamp_s: entry.timestamp_s, color, depth })
+    }
+
+    fn load_depth(&self, path: &Path) -> Result<DepthImage, SequenceError> {
+        let image::DynamicImage::ImageLuma16(raw) = decode(path)? else {
+            return Err(SequenceError::DepthFormat { path: path.into() });
+        };
+        self.check_size(path, raw.dimensions())?;
+        let metres_per_unit = (1.0 / self.camera.depth_units_per_metre) as f32;
+        let (width, height) = raw.dimensions();
+        Ok(DepthImage {
+            width,
+            height,
+            metres: raw.into_raw().into_iter().map(|units| f32::from(units) * metres_per_unit).collect(),
+        })
+    }
+
+    fn check_size(&self, path: &Path, (found_width, found_height): (u32, u32)) -> Result<(), SequenceError> {
+        let (width, height) = (self.camera.pinhole.width, self.camera.pinhole.height);
+        if (found_width, found_height) == (width, height) {
+            Ok(())
+        } else {
+            Err(SequenceError::Size { path: path.into(), width, height, found_width, found_height })
+        }
+    }
+}
+
+fn decode(path: &Path) -> Result<image::DynamicImage, SequenceError> {
+    let reader = image::ImageReader::open(path)
+        .and_then(image::ImageReader::with_guessed_format)
+        .map_err(|source| SequenceError::Read { path: path.into(), source })?;
+    reader.decode().map_err(|source| SequenceError::Image { path: path.into(), source })
+}

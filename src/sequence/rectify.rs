@@ -1,0 +1,153 @@
+//! Frames as the mapper wants them: without lens distortion, at the mapping resolution.
+
+use image::{Rgb, RgbImage};
+use nalgebra::Vector2;
+
+use super::{DepthImage, Frame};
+use crate::geometry::{Camera, Pinhole};
+
+/// Depths further apart than this share (of the nearest) lie on different surfaces and are not averaged.
+const SAME_SURFACE: f32 = 0.03;
+
+/// A frame seen through an ideal pinhole.
+#[derive(Clone, Debug)]
+pub struct RectifiedImage {
+    pub pinhole: Pinhole,
+    pub color: RgbImage,
+    pub depth: Option<DepthImage>,
+}
+
+/// The precomputed map from mapping pixels to recorded pixels.
+#[derive(Clone, Debug)]
+pub struct Rectifier {
+    pinhole: Pinhole,
+    /// `[height * width * samples²]` positions in the recorded image, grouped by mapping pixel.
+    sources: Vec<[f32; 2]>,
+    samples: usize,
+}
+
+impl Rectifier {
+    /// A map from `camera`'s recorded images to a pinhole image `scale` times their size (0 < scale ≤ 1).
+    pub fn new(camera: &Camera, scale: f64) -> Self {
+        let pinhole = camera.pinhole.scaled(scale);
+        // One bilinear sample per recorded pixel that a mapping pixel covers: a box filter.
+        let samples = (1.0 / scale).round().max(1.0) as usize;
+        let mut sources = Vec::with_capacity(pinhole.width as usize * pinhole.height as usize * samples * samples);
+        for y in 0..pinhole.height {
+            for x in 0..pinhole.width {
+                for sample in 0..samples * samples {
+                    let offset = |k: usize| (k as f64 + 0.5) / samples as f64 - 0.5;
+                    let ideal = Vector2::new(f64::from(x) + offset(sample % samples), f64::from(y) + offset(sample / samples));
+                    let full = &camera.pinhole;
+                    let in_full = Vector2::new(
+                        (ideal.x - pinhole.cx) / pinhole.fx * full.fx + full.cx,
+                        (ideal.y - pinhole.cy) / pinhole.fy * full.fy + full.cy,
+                    );
+                    let source = camera.distort_pixel(&in_full);
+                    sources.push([source.x as f32, source.y as f32]);
+                }
+            }
+        }
+        Self { pinhole, sources, samples }
+    }
+
+    pub fn pinhole(&self) -> Pinhole {
+        self.pinhole
+    }
+
+    /// Resamples colour (box filter over bilinear samples; the border repeats) and depth (mean over the nearest surface).
+    pub fn rectify(&self, frame: &Frame) -> RectifiedImage {
+        let mut color = RgbImage::new(self.pinhole.width, self.pinhole.height);
+        let group = self.samples * self.samples;
+        for (pixel, sources) in color.pixels_mut().zip(self.sources.chunks_exact(group)) {
+            let mut sum = [0.0f32; 3];
+            for source in sources {
+                let value = bilinear(&frame.color, *source);
+                (0..3).for_each(|c| sum[c] += value[c]);
+            }
+            *pixel = Rgb(sum.map(|v| (v / group as f32 + 0.5) as u8));
+        }
+        let depth = frame.depth.as_ref().map(|depth| DepthImage {
+            width: self.pinhole.width,
+            height: self.pinhole.height,
+            metres: self.sources.chunks_exact(group).map(|sources| nearest_surface(depth, sources)).collect(),
+        });
+        RectifiedImage { pinhole: self.pinhole, color, depth }
+    }
+}
+
+fn bilinear(image: &RgbImage, [x, y]: [f32; 2]) -> [f32; 3] {
+    let (x, y) = (x.clamp(0.0, image.width() as f32 - 1.0), y.clamp(0.0, image.height() as f32 - 1.0));
+    let (x0, y0) = (x as u32, y as u32);
+    let (x1, y1) = ((x0 + 1).min(image.width() - 1), (y0 + 1).min(image.height() - 1));
+    let (u, v) = (x - x0 as f32, y - y0 as f32);
+    let at = |x, y, c: usize| f32::from(image.get_pixel(x, y).0[c]);
+    std::array::from_fn(|c| {
+        (at(x0, y0, c) * (1.0 - u) + at(x1, y0, c) * u) * (1.0 - v) + (at(x0, y1, c) * (1.0 - u) + at(x1, y1, c) * u) * v
+    })
+}
+
+/// Mean of the samples on the nearest surface: averaging across a depth edge would invent points in mid-air.
+fn nearest_surface(depth: &DepthImage, sources: &[[f32; 2]]) -> f32 {
+    let at = |&[x, y]: &[f32; 2]| {
+        let (x, y) = (x.round(), y.round());
+        let inside = x >= 0.0 && y >= 0.0 && x < depth.width as f32 && y < depth.height as f32;
+        inside.then(|| depth.at(x as u32, y as u32)).flatten()
+    };
+    let nearest = sources.iter().filter_map(at).fold(f32::INFINITY, f32::min);
+    let (mut sum, mut count) = (0.0, 0.0);
+    for metres in sources.iter().filter_map(at).filter(|m| *m <= nearest * (1.0 + SAME_SURFACE)) {
+        sum += metres;
+        count += 1.0;
+    }
+    if count > 0.0 { sum / count } else { 0.0 }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::Distortion;
+
+    fn camera(distortion: Distortion) -> Camera {
+        let pinhole = Pinhole { fx: 60.0, fy: 60.0, cx: 31.5, cy: 23.5, width: 64, height: 48 };
+        Camera { pinhole, distortion, depth_units_per_metre: 5000.0 }
+    }
+
+    fn frame(depth: impl Fn(u32, u32) -> f32) -> Frame {
+        let metres = (0..64 * 48).map(|i| depth(i % 64, i / 64)).collect();
+        let color = RgbImage::from_fn(64, 48, |x, y| Rgb([x as u8 * 2, y as u8 * 2, 7]));
+        Frame { index: 0, timestamp_s: 0.0, color, depth: Some(DepthImage { width: 64, height: 48, metres }) }
+    }
+
+    #[test]
+    fn an_ideal_camera_at_full_scale_is_left_as_it_is() {
+        let frame = frame(|x, _| x as f32 * 0.01);
+        let rectified = Rectifier::new(&camera(Distortion::default()), 1.0).rectify(&frame);
+        assert_eq!(rectified.color, frame.color);
+        assert_eq!(rectified.depth.unwrap(), frame.depth.unwrap());
+    }
+
+    #[test]
+    fn halving_averages_colour_but_never_across_a_depth_edge() {
+        let frame = frame(|x, _| if x < 33 { 1.0 } else { 3.0 });
+        let rectified = Rectifier::new(&camera(Distortion::default()), 0.5).rectify(&frame);
+        assert_eq!(rectified.color.get_pixel(3, 0).0[0], 13);
+        assert!(rectified.depth.unwrap().metres.iter().all(|m| *m == 1.0 || *m == 3.0));
+    }
+
+    #[test]
+    fn a_distorted_ramp_becomes_straight() {
+        let lens = Distortion { k1: -0.2, ..Distortion::default() };
+        let camera = camera(lens);
+        // Colour encodes the ideal column; the recorded image shows it through the lens.
+        let mut frame = frame(|_, _| 0.0);
+        frame.color = RgbImage::from_fn(64, 48, |x, y| {
+            let ideal = camera.undistort_pixel(&Vector2::new(f64::from(x), f64::from(y)));
+            Rgb([(ideal.x * 3.0).clamp(0.0, 255.0).round() as u8; 3])
+        });
+        let rectified = Rectifier::new(&camera, 1.0).rectify(&frame);
+        for (x, y, pixel) in rectified.color.enumerate_pixels().filter(|(x, y, _)| (4..60).contains(x) && (4..44).contains(y)) {
+            assert!((f64::from(pixel.0[0]) - f64::from(x) * 3.0).abs() <= 1.5, "at {x},{y}");
+        }
+    }
+}

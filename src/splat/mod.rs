@@ -1,0 +1,92 @@
+//! The map: Gaussians as a structure of arrays, spherical harmonics, and immutable snapshots for everyone but the mapper.
+
+pub mod sh;
+
+use glam::{Quat, Vec3};
+
+pub use sh::ShDegree;
+
+/// Gaussians, structure of arrays; all arrays have the same number of Gaussians. Raw parameters are what the optimiser moves;
+/// the activated ones are `scale = exp(log_scale)`, `opacity = sigmoid(raw_opacity)`, `rotation / |rotation|`.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct GaussianCloud {
+    pub sh_degree: ShDegree,
+    /// `[N, 3]` world, metres.
+    pub means: Vec<Vec3>,
+    /// `[N, 3]` natural logarithm of the standard deviations along the Gaussian's own axes, metres.
+    pub log_scales: Vec<Vec3>,
+    /// `[N]` world from Gaussian, not necessarily of unit length.
+    pub rotations: Vec<Quat>,
+    /// `[N]` logit of the opacity.
+    pub raw_opacities: Vec<f32>,
+    /// `[N, K, 3]` spherical-harmonics coefficients, RGB; K = [`ShDegree::coefficients`].
+    pub sh: Vec<Vec3>,
+}
+
+/// One Gaussian, for building and looking at clouds.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Gaussian {
+    pub mean: Vec3,
+    pub log_scale: Vec3,
+    pub rotation: Quat,
+    pub raw_opacity: f32,
+    pub sh: Vec<Vec3>,
+}
+
+impl GaussianCloud {
+    pub fn new(sh_degree: ShDegree) -> Self {
+        Self { sh_degree, ..Self::default() }
+    }
+
+    pub fn len(&self) -> usize {
+        self.means.len()
+    }
+
+    pub fn is_empty(&self) -> bool {
+        self.means.is_empty()
+    }
+
+    /// Appends a Gaussian; missing coefficients are zero, superfluous ones are dropped.
+    pub fn push(&mut self, gaussian: Gaussian) {
+        self.means.push(gaussian.mean);
+        self.log_scales.push(gaussian.log_scale);
+        self.rotations.push(gaussian.rotation);
+        self.raw_opacities.push(gaussian.raw_opacity);
+        let zeros = std::iter::repeat(Vec3::ZERO);
+        self.sh.extend(gaussian.sh.into_iter().chain(zeros).take(self.sh_degree.coefficients()));
+    }
+
+    /// A copy of Gaussian `i`.
+    pub fn get(&self, i: usize) -> Gaussian {
+        let k = self.sh_degree.coefficients();
+        Gaussian {
+            mean: self.means[i],
+            log_scale: self.log_scales[i],
+            rotation: self.rotations[i],
+            raw_opacity: self.raw_opacities[i],
+            sh: self.sh[i * k..(i + 1) * k].to_vec(),
+        }
+    }
+
+    /// The index of the first Gaussian that holds a NaN or an infinity, if any.
+    pub fn first_non_finite(&self) -> Option<usize> {
+        let k = self.sh_degree.coefficients();
+        (0..self.len()).find(|&i| {
+            let finite = self.means[i].is_finite()
+                && self.log_scales[i].is_finite()
+                && self.rotations[i].is_finite()
+                && self.raw_opacities[i].is_finite()
+                && self.sh[i * k..(i + 1) * k].iter().all(|c| c.is_finite());
+            !finite
+        })
+    }
+}
+
+/// `logit`, the inverse of the sigmoid.
+pub fn raw_opacity_from_opacity(opacity: f32) -> f32 {
+    (opacity / (1.0 - opacity)).ln()
+}
+
+pub fn opacity_from_raw(raw_opacity: f32) -> f32 {
+    1.0 / (1.0 + (-raw_opacity).exp())
+}
