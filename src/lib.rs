@@ -2,5 +2,9 @@
 //! map and honest figures about both. `ARCHITECTURE.md` draws the whole; `CONVENTIONS.md` says what names, frames and units mean.
 
 pub mod geometry;
+pub mod gpu;
+pub mod optimise;
+pub mod reference;
+pub mod render;
 pub mod sequence;
 pub mod splat;

@@ -1,0 +1,174 @@
+// Carries the pairs' gradients through the projection to each visible Gaussian's parameters, and to the camera pose.
+//
+// One invocation a visible Gaussian; its pairs lie side by side and are summed in order. `begin_gradient` and `store_gradient` are the sink: it steps Adam at
+// once (`shared/sink_adam.wgsl`) or writes the gradient down (`shared/sink_gradient.wgsl`). The pose gradient is that of the left
+// perturbation T ← Exp(τ)·T of camera_from_world, τ = (ρ, θ).
+
+@group(0) @binding(0) var<uniform> view: View;
+@group(0) @binding(1) var<storage, read> counters: array<Counter>;
+@group(0) @binding(2) var<storage, read> order: array<u32>;
+@group(0) @binding(3) var<storage, read> pair_offsets: array<u32>;
+@group(0) @binding(4) var<storage, read> pair_gradients: array<vec4<f32>>;
+// [workgroups, 2] sums over the workgroup of (∂L/∂ρ, 0), (∂L/∂θ, 0).
+@group(0) @binding(5) var<storage, read_write> pose_sums: array<vec4<f32>>;
+
+var<workgroup> rho_sums: array<vec3<f32>, 256>;
+var<workgroup> theta_sums: array<vec3<f32>, 256>;
+
+struct PoseGradient {
+    rho: vec3<f32>,
+    theta: vec3<f32>,
+}
+
+@compute @workgroup_size(256)
+fn main(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
+    @builtin(local_invocation_index) local: u32,
+) {
+    let block = linear_workgroup(workgroup, workgroups);
+    let rank = block * 256u + local;
+    var pose = PoseGradient(vec3(0.0), vec3(0.0));
+    // Without room for all pairs nothing was rendered: the step will be repeated.
+    if rank < counters[VISIBLE_COUNTER].count && counters[PAIR_COUNTER].count > 0u {
+        pose = backward(rank);
+    }
+    rho_sums[local] = pose.rho;
+    theta_sums[local] = pose.theta;
+    for (var stride = 128u; stride > 0u; stride /= 2u) {
+        workgroupBarrier();
+        if local < stride {
+            rho_sums[local] += rho_sums[local + stride];
+            theta_sums[local] += theta_sums[local + stride];
+        }
+    }
+    if local == 0u {
+        pose_sums[block * 2u] = vec4(rho_sums[0], 0.0);
+        pose_sums[block * 2u + 1u] = vec4(theta_sums[0], 0.0);
+    }
+}
+
+fn backward(rank: u32) -> PoseGradient {
+    var color_depth = vec4(0.0);
+    var first = vec4(0.0);
+    var second = vec4(0.0);
+    var end = counters[PAIR_COUNTER].count;
+    if rank + 1u < counters[VISIBLE_COUNTER].count {
+        end = pair_offsets[rank + 1u];
+    }
+    for (var slot = pair_offsets[rank]; slot < end; slot++) {
+        color_depth += pair_gradients[slot * 3u];
+        first += pair_gradients[slot * 3u + 1u];
+        second += pair_gradients[slot * 3u + 2u];
+    }
+    let untouched = all(color_depth == vec4(0.0)) && all(first == vec4(0.0)) && all(second == vec4(0.0));
+    if untouched {
+        return PoseGradient(vec3(0.0), vec3(0.0));
+    }
+    let i = order[rank];
+    let mean_opacity = parameters[i];
+    let log_scale = parameters[view.capacity + i].xyz;
+    let rotation = parameters[2u * view.capacity + i];
+    let inverse_norm = inverseSqrt(dot(rotation, rotation));
+    let unit_rotation = rotation * inverse_norm;
+    let projection = project_gaussian(view, mean_opacity.xyz, log_scale, unit_rotation);
+
+    let c = projection.covariance;
+    let conic = vec3(c.z, -c.y, c.x) / (c.x * c.z - c.y * c.y);
+    let by_mean_2d = vec2(conic.x * first.y + conic.y * first.z, conic.y * first.y + conic.z * first.z);
+    // power = -½(a dx² + c dy²) - b dx dy; Σ2D's gradient is -P·G·P of the conic's, symmetric (xx, xy, yy).
+    let by_conic = vec3(-0.5 * second.x, -0.5 * second.y, -0.5 * second.z);
+    let by_covariance = -congruence(conic, by_conic);
+
+    // T = J·M: gradients of its rows, then of J's rows and of M's columns.
+    let axes = projection.axes_in_camera;
+    let row_x = projection.jacobian_x * axes;
+    let row_y = projection.jacobian_y * axes;
+    let by_row_x = 2.0 * (by_covariance.x * row_x + by_covariance.y * row_y);
+    let by_row_y = 2.0 * (by_covariance.y * row_x + by_covariance.z * row_y);
+    let by_jacobian_x = axes * by_row_x;
+    let by_jacobian_y = axes * by_row_y;
+    let by_axis_0 = projection.jacobian_x * by_row_x.x + projection.jacobian_y * by_row_y.x;
+    let by_axis_1 = projection.jacobian_x * by_row_x.y + projection.jacobian_y * by_row_y.y;
+    let by_axis_2 = projection.jacobian_x * by_row_x.z + projection.jacobian_y * by_row_y.z;
+
+    begin_gradient(i);
+    let by_point = point_gradient(projection, by_mean_2d, color_depth.w, by_jacobian_x, by_jacobian_y);
+    let by_mean_of_color = color_gradient(i, mean_opacity.xyz, color_depth.xyz);
+    let opacity = sigmoid(mean_opacity.w);
+    let by_mean = rotate_to_world(view, by_point) + by_mean_of_color;
+    store_gradient(0u, i, vec4(by_mean, (1.0 - opacity) * first.x));
+    store_gradient(1u, i, vec4(dot(by_axis_0, axes[0]), dot(by_axis_1, axes[1]), dot(by_axis_2, axes[2]), 0.0));
+    let scale = exp(log_scale);
+    let by_rotation_matrix = mat3x3(
+        rotate_to_world(view, by_axis_0) * scale.x,
+        rotate_to_world(view, by_axis_1) * scale.y,
+        rotate_to_world(view, by_axis_2) * scale.z,
+    );
+    let by_unit = quaternion_gradient(unit_rotation, by_rotation_matrix);
+    store_gradient(2u, i, (by_unit - unit_rotation * dot(unit_rotation, by_unit)) * inverse_norm);
+
+    var pose: PoseGradient;
+    pose.rho = by_point + rotate_to_camera(view, by_mean_of_color);
+    pose.theta = cross(projection.p_in_camera, by_point) + cross(axes[0], by_axis_0) + cross(axes[1], by_axis_1) + cross(axes[2], by_axis_2);
+    return pose;
+}
+
+// P·G·P for symmetric matrices held as (xx, xy, yy).
+fn congruence(p: vec3<f32>, g: vec3<f32>) -> vec3<f32> {
+    let pg_xx = p.x * g.x + p.y * g.y;
+    let pg_xy = p.x * g.y + p.y * g.z;
+    let pg_yx = p.y * g.x + p.z * g.y;
+    let pg_yy = p.y * g.y + p.z * g.z;
+    return vec3(pg_xx * p.x + pg_xy * p.y, pg_xx * p.y + pg_xy * p.z, pg_yx * p.y + pg_yy * p.z);
+}
+
+// Gradient with respect to the mean in the camera frame: through the image mean, the depth, and the Jacobian's own dependence.
+fn point_gradient(projection: Projection, by_mean_2d: vec2<f32>, by_depth: f32, by_jacobian_x: vec3<f32>, by_jacobian_y: vec3<f32>) -> vec3<f32> {
+    let f = view.intrinsics.xy;
+    let p = projection.p_in_camera;
+    let iz = 1.0 / p.z;
+    let scaled = f * by_mean_2d * iz;
+    var by_point = vec3(scaled, by_depth - dot(scaled, p.xy) * iz);
+    // J holds f/z and -f·t/z, t the tangent: x/z inside its bounds, a constant where clamped.
+    let by_slope = vec2(by_jacobian_x.z, by_jacobian_y.z) * f * iz * iz;
+    let by_focal = vec2(by_jacobian_x.x, by_jacobian_y.y) * f * iz * iz;
+    let tangent = vec2(-projection.jacobian_x.z, -projection.jacobian_y.z) * p.z / f;
+    by_point -= vec3(by_slope * projection.inside, 0.0);
+    by_point.z += dot(by_slope * tangent, vec2(1.0) + projection.inside) - by_focal.x - by_focal.y;
+    return by_point;
+}
+
+// Stores the coefficients' gradients; returns the mean's gradient through the view direction, world frame.
+fn color_gradient(i: u32, mean: vec3<f32>, by_color: vec3<f32>) -> vec3<f32> {
+    let coefficients = (view.sh_degree + 1u) * (view.sh_degree + 1u);
+    let offset = mean - view.center_in_world.xyz;
+    let distance = length(offset);
+    let direction = offset / distance;
+    var value = vec3(0.5);
+    for (var k = 0u; k < coefficients; k++) {
+        value += sh_basis(k, direction) * parameters[(3u + k) * view.capacity + i].xyz;
+    }
+    // A channel clamped at black has no gradient.
+    let free = select(vec3(0.0), by_color, value > vec3(0.0));
+    var by_direction = vec3(0.0);
+    for (var k = 0u; k < coefficients; k++) {
+        by_direction += sh_basis_gradient(k, direction) * dot(parameters[(3u + k) * view.capacity + i].xyz, free);
+        store_gradient(3u + k, i, vec4(sh_basis(k, direction) * free, 0.0));
+    }
+    return (by_direction - direction * dot(direction, by_direction)) / distance;
+}
+
+// Gradient with respect to the unit quaternion (w, x, y, z), from that of the rotation matrix (columns).
+fn quaternion_gradient(q: vec4<f32>, g: mat3x3<f32>) -> vec4<f32> {
+    let w = q.x;
+    let x = q.y;
+    let y = q.z;
+    let z = q.w;
+    return 2.0 * vec4(
+        x * (g[1].z - g[2].y) + y * (g[2].x - g[0].z) + z * (g[0].y - g[1].x),
+        w * (g[1].z - g[2].y) + y * (g[1].x + g[0].y) + z * (g[2].x + g[0].z) - 2.0 * x * (g[1].y + g[2].z),
+        w * (g[2].x - g[0].z) + x * (g[1].x + g[0].y) + z * (g[2].y + g[1].z) - 2.0 * y * (g[0].x + g[2].z),
+        w * (g[0].y - g[1].x) + x * (g[2].x + g[0].z) + y * (g[2].y + g[1].z) - 2.0 * z * (g[0].x + g[1].y),
+    );
+}

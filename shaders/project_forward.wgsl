@@ -1,0 +1,69 @@
+// Projects every Gaussian of the map into a view: image mean, conic, opacity, colour, depth; and says which can be seen at all.
+// One invocation a Gaussian. A culled one costs its tests only. Guards are written so that NaN fails them.
+
+@group(0) @binding(0) var<uniform> view: View;
+// [planes, capacity], see `render::layout::Plane`.
+@group(0) @binding(1) var<storage, read> parameters: array<vec4<f32>>;
+// [3, capacity]: (mean x, mean y, depth, cut), (conic xx, xy, yy, opacity), (r, g, b, -).
+@group(0) @binding(2) var<storage, read_write> projected: array<vec4<f32>>;
+// [N] 1 where the Gaussian may touch the image.
+@group(0) @binding(3) var<storage, read_write> visible: array<u32>;
+
+@compute @workgroup_size(256)
+fn main(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
+    @builtin(local_invocation_index) local: u32,
+) {
+    let i = linear_workgroup(workgroup, workgroups) * 256u + local;
+    if i < view.gaussian_count {
+        visible[i] = select(0u, 1u, project(i));
+    }
+}
+
+fn project(i: u32) -> bool {
+    let mean_opacity = parameters[i];
+    let depth = dot(view.camera_row_2.xyz, mean_opacity.xyz) + view.camera_row_2.w;
+    let opacity = sigmoid(mean_opacity.w);
+    if !(depth > NEAR_METRES && depth < FAR_METRES && opacity >= ALPHA_MIN) {
+        return false;
+    }
+    let rotation = parameters[2u * view.capacity + i];
+    let norm_squared = dot(rotation, rotation);
+    if !(norm_squared >= MIN_QUATERNION_NORM_SQUARED) {
+        return false;
+    }
+    let log_scale = parameters[view.capacity + i].xyz;
+    let projection = project_gaussian(view, mean_opacity.xyz, log_scale, rotation * inverseSqrt(norm_squared));
+    let c = projection.covariance;
+    let determinant = c.x * c.z - c.y * c.y;
+    if !(determinant >= MIN_DETERMINANT && determinant < 1e30) {
+        return false;
+    }
+    let p = projection.p_in_camera;
+    let mean = view.intrinsics.xy * p.xy / p.z + view.intrinsics.zw;
+    // -log(alpha) grows by ½dᵀΣ⁻¹d; alpha reaches ALPHA_MIN where that equals the cut.
+    let cut = log(opacity / ALPHA_MIN);
+    let half_extent = sqrt(2.0 * cut * c.xz);
+    let inside = (mean + half_extent >= vec2(-0.5)) & (mean - half_extent <= vec2(f32(view.width), f32(view.height)) - 0.5);
+    if !all(inside) {
+        return false;
+    }
+    let conic = vec3(c.z, -c.y, c.x) / determinant;
+    projected[i] = vec4(mean, depth, cut);
+    projected[view.capacity + i] = vec4(conic, opacity);
+    projected[2u * view.capacity + i] = vec4(color(i, mean_opacity.xyz), 0.0);
+    return true;
+}
+
+fn color(i: u32, mean: vec3<f32>) -> vec3<f32> {
+    var sum = vec3(0.5) + 0.28209479 * parameters[3u * view.capacity + i].xyz;
+    if view.sh_degree > 0u {
+        let direction = normalize(mean - view.center_in_world.xyz);
+        let coefficients = (view.sh_degree + 1u) * (view.sh_degree + 1u);
+        for (var k = 1u; k < coefficients; k++) {
+            sum += sh_basis(k, direction) * parameters[(3u + k) * view.capacity + i].xyz;
+        }
+    }
+    return max(sum, vec3(0.0));
+}

@@ -1,0 +1,54 @@
+// EWA projection of one Gaussian (Zwicker et al. 2001; Kerbl et al. 2023), shared by the forward and the backward pass.
+//
+// With N = R(q)·diag(s) the world covariance is N·Nᵀ. M = R_camera·N and T = J·M give the image covariance T·Tᵀ + dilation.
+
+struct Projection {
+    p_in_camera: vec3<f32>,
+    // Columns are the Gaussian's axes scaled by their standard deviations, in the camera frame, metres.
+    axes_in_camera: mat3x3<f32>,
+    // Rows of the Jacobian of the pinhole projection at the (clamped) mean, pixels per metre.
+    jacobian_x: vec3<f32>,
+    jacobian_y: vec3<f32>,
+    // Image covariance xx, xy, yy in pixels², dilated.
+    covariance: vec3<f32>,
+    // 1 where x/z (y/z) was inside its bounds, 0 where clamped.
+    inside: vec2<f32>,
+}
+
+fn rotation_matrix(q: vec4<f32>) -> mat3x3<f32> {
+    // q = (w, x, y, z) of unit length.
+    let w = q.x;
+    let v = q.yzw;
+    return mat3x3(
+        vec3(1.0 - 2.0 * (v.y * v.y + v.z * v.z), 2.0 * (v.x * v.y + w * v.z), 2.0 * (v.x * v.z - w * v.y)),
+        vec3(2.0 * (v.x * v.y - w * v.z), 1.0 - 2.0 * (v.x * v.x + v.z * v.z), 2.0 * (v.y * v.z + w * v.x)),
+        vec3(2.0 * (v.x * v.z + w * v.y), 2.0 * (v.y * v.z - w * v.x), 1.0 - 2.0 * (v.x * v.x + v.y * v.y)),
+    );
+}
+
+fn project_gaussian(view_: View, mean: vec3<f32>, log_scale: vec3<f32>, unit_rotation: vec4<f32>) -> Projection {
+    var out: Projection;
+    let p = rotate_to_camera(view_, mean) + translation(view_);
+    let scale = exp(log_scale);
+    let axes = rotation_matrix(unit_rotation);
+    out.p_in_camera = p;
+    out.axes_in_camera = mat3x3(
+        rotate_to_camera(view_, axes[0] * scale.x),
+        rotate_to_camera(view_, axes[1] * scale.y),
+        rotate_to_camera(view_, axes[2] * scale.z),
+    );
+    let inverse_z = 1.0 / p.z;
+    let tangent = p.xy * inverse_z;
+    let clamped = clamp(tangent, view_.tangent_bounds.xz, view_.tangent_bounds.yw);
+    out.inside = select(vec2(0.0), vec2(1.0), tangent == clamped);
+    out.jacobian_x = vec3(view_.intrinsics.x * inverse_z, 0.0, -view_.intrinsics.x * clamped.x * inverse_z);
+    out.jacobian_y = vec3(0.0, view_.intrinsics.y * inverse_z, -view_.intrinsics.y * clamped.y * inverse_z);
+    let row_x = out.jacobian_x * out.axes_in_camera;
+    let row_y = out.jacobian_y * out.axes_in_camera;
+    out.covariance = vec3(dot(row_x, row_x) + DILATION, dot(row_x, row_y), dot(row_y, row_y) + DILATION);
+    return out;
+}
+
+fn sigmoid(x: f32) -> f32 {
+    return 1.0 / (1.0 + exp(-x));
+}

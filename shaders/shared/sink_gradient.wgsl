@@ -1,0 +1,9 @@
+// Sink of `project_backward` that writes the gradient down, for tests and for whoever steps elsewhere. Cleared beforehand.
+@group(0) @binding(6) var<storage, read> parameters: array<vec4<f32>>;
+@group(0) @binding(7) var<storage, read_write> gradients: array<vec4<f32>>;
+
+fn begin_gradient(i: u32) {}
+
+fn store_gradient(plane: u32, i: u32, gradient: vec4<f32>) {
+    gradients[plane * view.capacity + i] = gradient;
+}

@@ -1,0 +1,42 @@
+// One camera view of the map; the host twin is `render::layout::View`.
+struct View {
+    // Rows of camera_from_world: rotation in xyz, translation in w; metres.
+    camera_row_0: vec4<f32>,
+    camera_row_1: vec4<f32>,
+    camera_row_2: vec4<f32>,
+    // Camera centre in the world, metres; w unused.
+    center_in_world: vec4<f32>,
+    // fx, fy, cx, cy in pixels.
+    intrinsics: vec4<f32>,
+    // Bounds on x/z and y/z inside the Jacobian: min x, max x, min y, max y.
+    tangent_bounds: vec4<f32>,
+    // Colour behind the map, RGB; w unused.
+    background: vec4<f32>,
+    // Image and tile grid sizes.
+    width: u32,
+    height: u32,
+    tiles_x: u32,
+    tiles_y: u32,
+    // Gaussians in the map, and the stride between parameter planes.
+    gaussian_count: u32,
+    capacity: u32,
+    sh_degree: u32,
+    pair_capacity: u32,
+}
+
+// Workgroups beyond 65,535 are laid out in two dimensions.
+fn linear_workgroup(workgroup: vec3<u32>, workgroups: vec3<u32>) -> u32 {
+    return workgroup.y * workgroups.x + workgroup.x;
+}
+
+fn rotate_to_camera(view_: View, v: vec3<f32>) -> vec3<f32> {
+    return vec3(dot(view_.camera_row_0.xyz, v), dot(view_.camera_row_1.xyz, v), dot(view_.camera_row_2.xyz, v));
+}
+
+fn rotate_to_world(view_: View, v: vec3<f32>) -> vec3<f32> {
+    return v.x * view_.camera_row_0.xyz + v.y * view_.camera_row_1.xyz + v.z * view_.camera_row_2.xyz;
+}
+
+fn translation(view_: View) -> vec3<f32> {
+    return vec3(view_.camera_row_0.w, view_.camera_row_1.w, view_.camera_row_2.w);
+}

@@ -1,0 +1,98 @@
+// Lists the tiles that each visible Gaussian really touches, nearest Gaussian first: once to count, once to emit.
+//
+// A tile is touched where the ellipse of alpha ≥ 1/255 reaches one of its pixel centres' hull: the minimum of the quadratic form
+// over the tile's rectangle is compared with the cut. The same pipeline runs both modes, so that they cannot disagree.
+
+struct TileListsSetup {
+    // 0 counts, 1 emits.
+    emit: u32,
+}
+
+@group(0) @binding(0) var<uniform> view: View;
+@group(0) @binding(1) var<uniform> setup: TileListsSetup;
+@group(0) @binding(2) var<storage, read> counters: array<Counter>;
+@group(0) @binding(3) var<storage, read> order: array<u32>;
+@group(0) @binding(4) var<storage, read> projected: array<vec4<f32>>;
+// [visible] tiles of each Gaussian (mode 0), and where its pairs begin (mode 1).
+@group(0) @binding(5) var<storage, read_write> pair_counts: array<u32>;
+@group(0) @binding(6) var<storage, read> pair_offsets: array<u32>;
+// [pairs] tile, and the pair's slot, before the tile sort.
+@group(0) @binding(7) var<storage, read_write> tile_keys: array<u32>;
+@group(0) @binding(8) var<storage, read_write> slots: array<u32>;
+// [pairs] Gaussian of each slot.
+@group(0) @binding(9) var<storage, read_write> slot_gaussians: array<u32>;
+
+// Slack for rounding, in units of the quadratic form: a tile too many costs time, one too few a seam.
+const SLACK: f32 = 1e-3;
+
+@compute @workgroup_size(256)
+fn main(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
+    @builtin(local_invocation_index) local: u32,
+) {
+    let rank = linear_workgroup(workgroup, workgroups) * 256u + local;
+    if rank >= counters[VISIBLE_COUNTER].count {
+        return;
+    }
+    let gaussian = order[rank];
+    let mean_cut = projected[gaussian];
+    let conic = projected[view.capacity + gaussian].xyz;
+    let limit = mean_cut.w * (1.0 + SLACK) + SLACK;
+    let mean = mean_cut.xy;
+    // The covariance is the conic's inverse; its diagonal gives the half extents of the ellipse.
+    let determinant = conic.x * conic.z - conic.y * conic.y;
+    let half_extent = sqrt(2.0 * limit * vec2(conic.z, conic.x) / determinant);
+    let last_tile = vec2<f32>(f32(view.tiles_x), f32(view.tiles_y)) - 1.0;
+    let tile_size = vec2(f32(TILE_WIDTH), f32(TILE_HEIGHT));
+    // Pixel centres are integers, so a tile's pixels span [first, first + size - 1].
+    let low = vec2<u32>(clamp(floor((mean - half_extent) / tile_size), vec2(0.0), last_tile));
+    let high = vec2<u32>(clamp(floor((mean + half_extent) / tile_size), vec2(0.0), last_tile));
+    var found = 0u;
+    var slot = 0u;
+    let emit = setup.emit == 1u && counters[PAIR_COUNTER].count > 0u;
+    if emit {
+        slot = pair_offsets[rank];
+    }
+    for (var y = low.y; y <= high.y; y++) {
+        for (var x = low.x; x <= high.x; x++) {
+            if !touches(mean, conic, limit, vec2(f32(x), f32(y)) * tile_size, tile_size - 1.0) {
+                continue;
+            }
+            if emit {
+                tile_keys[slot + found] = y * view.tiles_x + x;
+                slots[slot + found] = slot + found;
+                slot_gaussians[slot + found] = gaussian;
+            }
+            found++;
+        }
+    }
+    if setup.emit == 0u {
+        pair_counts[rank] = found;
+    }
+}
+
+// Whether ½dᵀPd ≤ limit somewhere on the rectangle [first, first + span], d measured from the mean. The form is convex: its minimum
+// is 0 inside, else on one of the two edges that face the mean.
+fn touches(mean: vec2<f32>, conic: vec3<f32>, limit: f32, first: vec2<f32>, span: vec2<f32>) -> bool {
+    let low = first - mean;
+    let high = low + span;
+    let nearest = clamp(vec2(0.0), low, high);
+    var smallest = 1e30;
+    if all(nearest == vec2(0.0)) {
+        return true;
+    }
+    if nearest.x != 0.0 {
+        let y = clamp(-conic.y * nearest.x / conic.z, low.y, high.y);
+        smallest = min(smallest, form(conic, vec2(nearest.x, y)));
+    }
+    if nearest.y != 0.0 {
+        let x = clamp(-conic.y * nearest.y / conic.x, low.x, high.x);
+        smallest = min(smallest, form(conic, vec2(x, nearest.y)));
+    }
+    return smallest <= limit;
+}
+
+fn form(conic: vec3<f32>, d: vec2<f32>) -> f32 {
+    return 0.5 * (conic.x * d.x * d.x + conic.z * d.y * d.y) + conic.y * d.x * d.y;
+}

@@ -1,0 +1,85 @@
+//! Buffers that count themselves, refuse impossible sizes, and read back.
+
+use std::sync::Arc;
+
+use bytemuck::Pod;
+use wgpu::BufferUsages;
+
+use super::device::MemoryCount;
+use super::{Gpu, GpuError};
+
+/// A GPU buffer with its place in the memory count.
+#[derive(Debug)]
+pub struct GpuBuffer {
+    raw: wgpu::Buffer,
+    memory: Arc<MemoryCount>,
+}
+
+impl GpuBuffer {
+    /// Storage of `bytes` (rounded up, zeroed) that can be written, copied and used for indirect dispatch.
+    pub fn storage(gpu: &Gpu, label: &str, bytes: u64) -> Result<Self, GpuError> {
+        let usage = BufferUsages::STORAGE | BufferUsages::COPY_DST | BufferUsages::COPY_SRC | BufferUsages::INDIRECT;
+        let limit = gpu.device.limits().max_storage_buffer_binding_size.min(gpu.device.limits().max_buffer_size);
+        Self::create(gpu, label, bytes, usage, limit)
+    }
+
+    /// A uniform that holds `value`.
+    pub fn uniform<T: Pod>(gpu: &Gpu, label: &str, value: &T) -> Result<Self, GpuError> {
+        let bytes = std::mem::size_of::<T>() as u64;
+        let limit = gpu.device.limits().max_uniform_buffer_binding_size;
+        let buffer = Self::create(gpu, label, bytes, BufferUsages::UNIFORM | BufferUsages::COPY_DST, limit)?;
+        buffer.write(gpu, 0, std::slice::from_ref(value));
+        Ok(buffer)
+    }
+
+    fn create(gpu: &Gpu, label: &str, bytes: u64, usage: BufferUsages, limit: u64) -> Result<Self, GpuError> {
+        let size = bytes.max(16).next_multiple_of(16);
+        if size > limit {
+            return Err(GpuError::TooLarge { label: label.into(), needed: size, limit });
+        }
+        let raw =
+            gpu.device.create_buffer(&wgpu::BufferDescriptor { label: Some(label), size, usage, mapped_at_creation: false });
+        gpu.memory.add(size);
+        Ok(Self { raw, memory: gpu.memory.clone() })
+    }
+
+    pub fn raw(&self) -> &wgpu::Buffer {
+        &self.raw
+    }
+
+    /// Writes `values` from element `first` (of their own size) on; it takes effect before the next submission.
+    pub fn write<T: Pod>(&self, gpu: &Gpu, first: usize, values: &[T]) {
+        if !values.is_empty() {
+            gpu.queue.write_buffer(&self.raw, (first * std::mem::size_of::<T>()) as u64, bytemuck::cast_slice(values));
+        }
+    }
+
+    /// Waits for all work and reads `count` elements from element `first` on.
+    pub fn read<T: Pod>(&self, gpu: &Gpu, first: usize, count: usize) -> Result<Vec<T>, GpuError> {
+        let element = std::mem::size_of::<T>();
+        let bytes = (count * element) as u64;
+        if bytes == 0 {
+            return Ok(Vec::new());
+        }
+        let staging = gpu.device.create_buffer(&wgpu::BufferDescriptor {
+            label: Some("readback"),
+            size: bytes,
+            usage: BufferUsages::MAP_READ | BufferUsages::COPY_DST,
+            mapped_at_creation: false,
+        });
+        let mut encoder = gpu.device.create_command_encoder(&Default::default());
+        encoder.copy_buffer_to_buffer(&self.raw, (first * element) as u64, &staging, 0, bytes);
+        gpu.queue.submit([encoder.finish()]);
+        staging.map_async(wgpu::MapMode::Read, .., |_| {});
+        gpu.wait()?;
+        let view = staging.get_mapped_range(..).map_err(|e| GpuError::Failed(e.to_string()))?;
+        // The mapping has no alignment that a cast could rely on.
+        Ok(view.chunks_exact(element).map(bytemuck::pod_read_unaligned).collect())
+    }
+}
+
+impl Drop for GpuBuffer {
+    fn drop(&mut self) {
+        self.memory.remove(self.raw.size());
+    }
+}

@@ -1,0 +1,185 @@
+//! Adapter choice, device creation, and errors that surface asynchronously.
+
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+
+use serde::Serialize;
+use wgpu::{Backends, InstanceDescriptor, InstanceFlags};
+
+#[derive(Debug, thiserror::Error)]
+pub enum GpuError {
+    #[error(
+        "no GPU adapter was found; install a Vulkan driver, or Mesa's software one (`apt-get install mesa-vulkan-drivers libvulkan1`), and see what there is with `keysplat adapters`"
+    )]
+    NoAdapter,
+    #[error("no adapter's name contains `{wanted}`; there are: {found}")]
+    NoSuchAdapter { wanted: String, found: String },
+    #[error("the adapter {adapter} gives no device: {source}")]
+    Device { adapter: String, source: wgpu::RequestDeviceError },
+    #[error(
+        "{label} needs a buffer of {needed} bytes, but the adapter binds at most {limit}; lower the mapping resolution (--map-scale) or the number of Gaussians"
+    )]
+    TooLarge { label: String, needed: u64, limit: u64 },
+    #[error("the GPU ran out of memory ({0}); lower the mapping resolution (--map-scale) or the number of Gaussians")]
+    OutOfMemory(String),
+    #[error("the GPU device failed: {0}")]
+    Failed(String),
+}
+
+/// What identifies an adapter in metrics and lists.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct AdapterSummary {
+    pub name: String,
+    pub backend: String,
+    pub kind: String,
+    pub driver: String,
+}
+
+impl From<wgpu::AdapterInfo> for AdapterSummary {
+    fn from(info: wgpu::AdapterInfo) -> Self {
+        let kind = match info.device_type {
+            wgpu::DeviceType::DiscreteGpu => "discrete",
+            wgpu::DeviceType::IntegratedGpu => "integrated",
+            wgpu::DeviceType::VirtualGpu => "virtual",
+            wgpu::DeviceType::Cpu => "cpu",
+            wgpu::DeviceType::Other => "other",
+        };
+        Self {
+            name: info.name,
+            backend: format!("{:?}", info.backend).to_lowercase(),
+            kind: kind.into(),
+            driver: format!("{} {}", info.driver, info.driver_info).trim().into(),
+        }
+    }
+}
+
+/// A device with its queue, and what is known of it.
+#[derive(Debug)]
+pub struct Gpu {
+    pub device: wgpu::Device,
+    pub queue: wgpu::Queue,
+    pub adapter: AdapterSummary,
+    failure: Arc<Mutex<Option<Failure>>>,
+    pub(super) memory: Arc<MemoryCount>,
+}
+
+#[derive(Debug)]
+enum Failure {
+    OutOfMemory(String),
+    Failed(String),
+}
+
+/// Bytes in our buffers, now and at most.
+#[derive(Debug, Default)]
+pub(super) struct MemoryCount {
+    now: AtomicU64,
+    peak: AtomicU64,
+}
+
+impl MemoryCount {
+    pub(super) fn add(&self, bytes: u64) {
+        let now = self.now.fetch_add(bytes, Ordering::Relaxed) + bytes;
+        self.peak.fetch_max(now, Ordering::Relaxed);
+    }
+
+    pub(super) fn remove(&self, bytes: u64) {
+        self.now.fetch_sub(bytes, Ordering::Relaxed);
+    }
+}
+
+fn instance() -> wgpu::Instance {
+    let mut descriptor = InstanceDescriptor::new_without_display_handle_from_env();
+    // Our own kernels write the indirect arguments, within bounds; wgpu's check would cost a dispatch for each of ours.
+    descriptor.flags.remove(InstanceFlags::VALIDATION_INDIRECT_CALL);
+    wgpu::Instance::new(descriptor)
+}
+
+/// All adapters of this machine, fastest kind first.
+fn sorted_adapters(instance: &wgpu::Instance) -> Vec<wgpu::Adapter> {
+    let mut adapters = pollster::block_on(instance.enumerate_adapters(Backends::PRIMARY));
+    adapters.sort_by_key(|adapter| match adapter.get_info().device_type {
+        wgpu::DeviceType::DiscreteGpu => 0,
+        wgpu::DeviceType::IntegratedGpu => 1,
+        wgpu::DeviceType::VirtualGpu => 2,
+        wgpu::DeviceType::Other => 3,
+        wgpu::DeviceType::Cpu => 4,
+    });
+    adapters
+}
+
+/// Lists this machine's adapters, the one that would be chosen first.
+pub fn adapters() -> Vec<AdapterSummary> {
+    sorted_adapters(&instance()).iter().map(|adapter| adapter.get_info().into()).collect()
+}
+
+impl Gpu {
+    /// Opens the fastest adapter, or the first whose name contains `wanted` (any case).
+    pub fn open(wanted: Option<&str>) -> Result<Arc<Self>, GpuError> {
+        let mut adapters = sorted_adapters(&instance());
+        if adapters.is_empty() {
+            return Err(GpuError::NoAdapter);
+        }
+        let names: Vec<String> = adapters.iter().map(|a| a.get_info().name).collect();
+        let index = match wanted {
+            None => 0,
+            Some(wanted) => names
+                .iter()
+                .position(|name| name.to_lowercase().contains(&wanted.to_lowercase()))
+                .ok_or_else(|| GpuError::NoSuchAdapter { wanted: wanted.into(), found: names.join(", ") })?,
+        };
+        let adapter = adapters.swap_remove(index);
+        // Everything runs within WebGPU's defaults; only the sizes of buffers are asked for in full.
+        let offered = adapter.limits();
+        let required_limits = wgpu::Limits {
+            max_buffer_size: offered.max_buffer_size,
+            max_storage_buffer_binding_size: offered.max_storage_buffer_binding_size,
+            ..wgpu::Limits::default()
+        };
+        let descriptor = wgpu::DeviceDescriptor { label: Some("keysplat"), required_limits, ..Default::default() };
+        let (device, queue) = pollster::block_on(adapter.request_device(&descriptor))
+            .map_err(|source| GpuError::Device { adapter: names[index].clone(), source })?;
+        let failure = Arc::new(Mutex::new(None));
+        watch(&device, &failure);
+        Ok(Arc::new(Self { device, queue, adapter: adapter.get_info().into(), failure, memory: Arc::default() }))
+    }
+
+    /// The first failure that the device reported since it was opened, if any.
+    pub fn check(&self) -> Result<(), GpuError> {
+        match &*self.failure.lock().unwrap_or_else(PoisonError::into_inner) {
+            None => Ok(()),
+            Some(Failure::OutOfMemory(what)) => Err(GpuError::OutOfMemory(what.clone())),
+            Some(Failure::Failed(what)) => Err(GpuError::Failed(what.clone())),
+        }
+    }
+
+    /// Waits until everything submitted is done.
+    pub fn wait(&self) -> Result<(), GpuError> {
+        self.device.poll(wgpu::PollType::wait_indefinitely()).map_err(|e| GpuError::Failed(e.to_string()))?;
+        self.check()
+    }
+
+    /// The most bytes that our buffers held at any time.
+    pub fn peak_bytes(&self) -> u64 {
+        self.memory.peak.load(Ordering::Relaxed)
+    }
+}
+
+fn watch(device: &wgpu::Device, failure: &Arc<Mutex<Option<Failure>>>) {
+    let note = |slot: &Mutex<Option<Failure>>, found: Failure| {
+        slot.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(found);
+    };
+    let slot = failure.clone();
+    device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| {
+        let found = match error {
+            wgpu::Error::OutOfMemory { source } => Failure::OutOfMemory(source.to_string()),
+            other => Failure::Failed(other.to_string()),
+        };
+        note(&slot, found);
+    }));
+    let slot = failure.clone();
+    device.set_device_lost_callback(move |reason, message| {
+        if !matches!(reason, wgpu::DeviceLostReason::Destroyed) {
+            note(&slot, Failure::Failed(format!("device lost: {message}")));
+        }
+    });
+}

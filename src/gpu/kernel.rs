@@ -1,0 +1,73 @@
+//! One compute pipeline with its bindings, which are read from the shader itself.
+
+use super::{Gpu, GpuBuffer};
+
+/// A compiled entry point.
+#[derive(Debug)]
+pub struct Kernel {
+    pipeline: wgpu::ComputePipeline,
+    layout: wgpu::BindGroupLayout,
+    label: &'static str,
+}
+
+/// Dispatch size for `count` workgroups: beyond 65,535 they continue in a second dimension (`linear_workgroup` in the shaders).
+pub fn workgroups(count: u32) -> [u32; 3] {
+    const MAX_PER_DIMENSION: u32 = 65_535;
+    [count.min(MAX_PER_DIMENSION), count.div_ceil(MAX_PER_DIMENSION).max(1), 1]
+}
+
+impl Kernel {
+    /// Compiles `entry_point` of a WGSL `source`.
+    pub fn new(gpu: &Gpu, label: &'static str, entry_point: &str, source: &str) -> Self {
+        let module = gpu.device.create_shader_module(wgpu::ShaderModuleDescriptor {
+            label: Some(label),
+            source: wgpu::ShaderSource::Wgsl(source.into()),
+        });
+        let pipeline = gpu.device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+            label: Some(label),
+            layout: None,
+            module: &module,
+            entry_point: Some(entry_point),
+            compilation_options: wgpu::PipelineCompilationOptions {
+                // The rasterizer counts finished invocations from zero.
+                zero_initialize_workgroup_memory: true,
+                ..Default::default()
+            },
+            cache: None,
+        });
+        let layout = pipeline.get_bind_group_layout(0);
+        Self { pipeline, layout, label }
+    }
+
+    fn bind(&self, gpu: &Gpu, bindings: &[(u32, &GpuBuffer)]) -> wgpu::BindGroup {
+        let entries: Vec<wgpu::BindGroupEntry> = bindings
+            .iter()
+            .map(|(binding, buffer)| wgpu::BindGroupEntry { binding: *binding, resource: buffer.raw().as_entire_binding() })
+            .collect();
+        gpu.device.create_bind_group(&wgpu::BindGroupDescriptor {
+            label: Some(self.label),
+            layout: &self.layout,
+            entries: &entries,
+        })
+    }
+
+    /// Runs with a size known on the host.
+    pub fn dispatch(&self, gpu: &Gpu, pass: &mut wgpu::ComputePass<'_>, bindings: &[(u32, &GpuBuffer)], size: [u32; 3]) {
+        pass.set_pipeline(&self.pipeline);
+        pass.set_bind_group(0, &self.bind(gpu, bindings), &[]);
+        pass.dispatch_workgroups(size[0], size[1], size[2]);
+    }
+
+    /// Runs with the size that lies in `arguments` at `offset` bytes.
+    pub fn dispatch_indirect(
+        &self,
+        gpu: &Gpu,
+        pass: &mut wgpu::ComputePass<'_>,
+        bindings: &[(u32, &GpuBuffer)],
+        (arguments, offset): (&GpuBuffer, u64),
+    ) {
+        pass.set_pipeline(&self.pipeline);
+        pass.set_bind_group(0, &self.bind(gpu, bindings), &[]);
+        pass.dispatch_workgroups_indirect(arguments.raw(), offset);
+    }
+}

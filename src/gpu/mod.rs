@@ -1,0 +1,9 @@
+//! The compute device: adapters, buffers, kernels, readback. No algorithm lives here.
+
+mod buffer;
+mod device;
+mod kernel;
+
+pub use buffer::GpuBuffer;
+pub use device::{AdapterSummary, Gpu, GpuError, adapters};
+pub use kernel::{Kernel, workgroups};

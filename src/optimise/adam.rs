@@ -1,0 +1,85 @@
+//! Adam's step sizes, and their form on the GPU.
+
+use bytemuck::{Pod, Zeroable};
+use serde::{Deserialize, Serialize};
+
+/// Step sizes and decay rates (Kingma & Ba 2015; the ratios between parameters follow 3DGS, Kerbl et al. 2023).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct AdamConfig {
+    /// Position, metres a step.
+    pub position_rate: f32,
+    /// Raw opacity (logit) a step.
+    pub opacity_rate: f32,
+    /// Log scale a step.
+    pub scale_rate: f32,
+    /// Quaternion component a step.
+    pub rotation_rate: f32,
+    /// Constant colour coefficient a step.
+    pub color_rate: f32,
+    /// Other harmonics' coefficients a step.
+    pub harmonics_rate: f32,
+    /// Decay of the first and the second moments.
+    pub beta_1: f32,
+    pub beta_2: f32,
+    pub epsilon: f32,
+}
+
+impl Default for AdamConfig {
+    fn default() -> Self {
+        Self {
+            position_rate: 2e-4,
+            opacity_rate: 2.5e-2,
+            scale_rate: 5e-3,
+            rotation_rate: 1e-3,
+            color_rate: 5e-3,
+            harmonics_rate: 2.5e-4,
+            beta_1: 0.9,
+            beta_2: 0.999,
+            epsilon: 1e-15,
+        }
+    }
+}
+
+impl AdamConfig {
+    /// Says what is wrong with the values, if anything.
+    pub fn validate(&self) -> Result<(), String> {
+        let rates =
+            [self.position_rate, self.opacity_rate, self.scale_rate, self.rotation_rate, self.color_rate, self.harmonics_rate];
+        if rates.iter().any(|rate| !(rate.is_finite() && *rate >= 0.0)) {
+            return Err("every Adam rate must be finite and not negative".into());
+        }
+        if ![self.beta_1, self.beta_2].iter().all(|beta| (0.0..1.0).contains(beta)) || self.beta_1 == 0.0 || self.beta_2 == 0.0 {
+            return Err("beta_1 and beta_2 must lie between 0 and 1, both excluded".into());
+        }
+        if self.epsilon.is_finite() && self.epsilon > 0.0 { Ok(()) } else { Err("epsilon must be positive".into()) }
+    }
+}
+
+/// Host twin of `AdamSetup` in `shaders/shared/sink_adam.wgsl`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+pub(super) struct AdamSetup {
+    rates: [[f32; 4]; 5],
+    beta_1: f32,
+    beta_2: f32,
+    epsilon: f32,
+    log_beta_1: f32,
+    log_beta_2: f32,
+    pad: [f32; 3],
+}
+
+impl From<&AdamConfig> for AdamSetup {
+    fn from(c: &AdamConfig) -> Self {
+        let p = c.position_rate;
+        Self {
+            rates: [[p, p, p, c.opacity_rate], [c.scale_rate; 4], [c.rotation_rate; 4], [c.color_rate; 4], [c.harmonics_rate; 4]],
+            beta_1: c.beta_1,
+            beta_2: c.beta_2,
+            epsilon: c.epsilon,
+            log_beta_1: c.beta_1.ln(),
+            log_beta_2: c.beta_2.ln(),
+            pad: [0.0; 3],
+        }
+    }
+}

@@ -1,0 +1,104 @@
+//! What a view should look like, and the weights of the loss.
+
+use bytemuck::{Pod, Zeroable};
+use serde::{Deserialize, Serialize};
+
+use crate::gpu::{Gpu, GpuBuffer, GpuError};
+use crate::sequence::RectifiedImage;
+
+/// Weights of the image loss `(1-λ)·L1 + λ·(1-SSIM) + λ_depth·L1(depth)`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct LossConfig {
+    /// λ, the share of SSIM against L1 (3DGS: 0.2).
+    pub ssim_weight: f32,
+    /// λ_depth, per metre of depth error.
+    pub depth_weight: f32,
+}
+
+impl Default for LossConfig {
+    fn default() -> Self {
+        Self { ssim_weight: 0.2, depth_weight: 0.1 }
+    }
+}
+
+impl LossConfig {
+    /// Says what is wrong with the values, if anything.
+    pub fn validate(&self) -> Result<(), String> {
+        if !(0.0..=1.0).contains(&self.ssim_weight) {
+            return Err("ssim_weight must lie between 0 and 1".into());
+        }
+        if self.depth_weight.is_finite() && self.depth_weight >= 0.0 {
+            Ok(())
+        } else {
+            Err("depth_weight must be finite and not negative".into())
+        }
+    }
+}
+
+/// Mean loss terms of one view.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct LossTerms {
+    /// Mean |colour error| and mean SSIM over pixels and channels.
+    pub l1: f32,
+    pub ssim: f32,
+    /// Mean |Σ w z - α·sensor depth| over all pixels, metres.
+    pub depth_metres: f32,
+    /// Mean squared colour error.
+    pub mse: f32,
+}
+
+impl LossTerms {
+    pub(super) fn from_sums(sums: [f32; 4], pixels: u32) -> Self {
+        let pixels = pixels as f32;
+        Self {
+            l1: sums[0] / pixels / 3.0,
+            ssim: sums[1] / pixels / 3.0,
+            depth_metres: sums[2] / pixels,
+            mse: sums[3] / pixels / 3.0,
+        }
+    }
+
+    /// The weighted sum that is minimised.
+    pub fn total(&self, config: &LossConfig) -> f32 {
+        (1.0 - config.ssim_weight) * self.l1 + config.ssim_weight * (1.0 - self.ssim) + config.depth_weight * self.depth_metres
+    }
+
+    pub fn psnr_db(&self) -> f32 {
+        -10.0 * self.mse.max(1e-10).log10()
+    }
+}
+
+/// Host twin of `LossSetup` in the loss shaders.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+pub(super) struct LossSetup {
+    pub width: u32,
+    pub height: u32,
+    pub ssim_weight: f32,
+    pub depth_weight: f32,
+}
+
+/// A keyframe's image on the GPU: 8-bit colour and sensor depth.
+#[derive(Debug)]
+pub struct TargetImage {
+    pub width: u32,
+    pub height: u32,
+    pub(super) color: GpuBuffer,
+    pub(super) depth: GpuBuffer,
+}
+
+impl TargetImage {
+    /// Uploads a rectified image; pixels without depth do not enter the depth loss.
+    pub fn new(gpu: &Gpu, image: &RectifiedImage) -> Result<Self, GpuError> {
+        let (width, height) = image.color.dimensions();
+        let packed: Vec<u32> = image.color.pixels().map(|p| u32::from_le_bytes([p.0[0], p.0[1], p.0[2], 255])).collect();
+        let color = GpuBuffer::storage(gpu, "target colour", packed.len() as u64 * 4)?;
+        color.write(gpu, 0, &packed);
+        let depth = GpuBuffer::storage(gpu, "target depth", packed.len() as u64 * 4)?;
+        if let Some(measured) = &image.depth {
+            depth.write(gpu, 0, &measured.metres);
+        }
+        Ok(Self { width, height, color, depth })
+    }
+}

@@ -1,0 +1,9 @@
+//! Moving the map towards the keyframes: the image loss, its gradient, and Adam, all on the GPU.
+
+mod adam;
+mod loss;
+mod optimiser;
+
+pub use adam::AdamConfig;
+pub use loss::{LossConfig, LossTerms, TargetImage};
+pub use optimiser::{Gradients, Optimiser, StepReport};

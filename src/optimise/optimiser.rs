@@ -1,0 +1,283 @@
+//! One training step on the GPU: forward, loss, backward, Adam; and the same without stepping, for whoever wants the gradients.
+
+use super::adam::AdamSetup;
+use super::loss::LossSetup;
+use super::{AdamConfig, LossConfig, LossTerms, TargetImage};
+use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, workgroups};
+use crate::render::layout::{Counter, VISIBLE_COUNTER, View, ViewCamera};
+use crate::render::{GpuCloud, PreparedView, Rasterizer, ViewCounts, cloud_from_planes, shaders};
+use crate::splat::GaussianCloud;
+
+const LOSS_TILE: u32 = 16;
+
+/// What a step did.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct StepReport {
+    pub loss: LossTerms,
+    pub counts: ViewCounts,
+}
+
+/// Gradient of a loss by the map and by the pose.
+#[derive(Clone, Debug)]
+pub struct Gradients {
+    pub loss: LossTerms,
+    /// By the raw parameters of each Gaussian, in the shape of the map.
+    pub cloud: GaussianCloud,
+    /// By τ = (ρ, θ) of `camera_from_world ← Exp(τ)·camera_from_world`.
+    pub pose: [f32; 6],
+}
+
+/// Where the backward pass starts from.
+enum Objective<'a> {
+    Image(&'a TargetImage, &'a LossConfig),
+    /// Gradients by the image are in the buffer already.
+    Given,
+}
+
+/// What the backward pass ends in.
+enum Sink<'a> {
+    Adam(&'a GpuBuffer),
+    Gradient(&'a GpuBuffer),
+}
+
+#[derive(Debug)]
+struct Kernels {
+    loss_forward: Kernel,
+    loss_reduce: Kernel,
+    loss_backward: Kernel,
+    rasterize_backward: Kernel,
+    project_backward: Kernel,
+    project_backward_adam: Kernel,
+    pose_reduce: Kernel,
+}
+
+/// The training step with its scratch buffers.
+#[derive(Debug)]
+pub struct Optimiser {
+    kernels: Kernels,
+    pixels: u32,
+    gaussians: usize,
+    partials: GpuBuffer,
+    image_gradients: GpuBuffer,
+    loss_sums: GpuBuffer,
+    loss_total: GpuBuffer,
+    pose_sums: GpuBuffer,
+    pose_gradient: GpuBuffer,
+}
+
+impl Optimiser {
+    pub fn new(gpu: &Gpu) -> Result<Self, GpuError> {
+        let kernel = |source: &shaders::ShaderSource| Kernel::new(gpu, source.name, "main", &source.text());
+        let kernels = Kernels {
+            loss_forward: kernel(&shaders::LOSS_FORWARD),
+            loss_reduce: kernel(&shaders::LOSS_REDUCE),
+            loss_backward: kernel(&shaders::LOSS_BACKWARD),
+            rasterize_backward: kernel(&shaders::RASTERIZE_BACKWARD),
+            project_backward: kernel(&shaders::PROJECT_BACKWARD),
+            project_backward_adam: kernel(&shaders::PROJECT_BACKWARD_ADAM),
+            pose_reduce: kernel(&shaders::POSE_REDUCE),
+        };
+        gpu.check()?;
+        let empty = |label: &str| GpuBuffer::storage(gpu, label, 16);
+        Ok(Self {
+            kernels,
+            pixels: 0,
+            gaussians: 0,
+            partials: empty("loss partials")?,
+            image_gradients: empty("image gradients")?,
+            loss_sums: empty("loss sums")?,
+            loss_total: empty("loss")?,
+            pose_sums: empty("pose sums")?,
+            pose_gradient: GpuBuffer::storage(gpu, "pose gradient", 32)?,
+        })
+    }
+
+    /// Renders the map from `camera`, compares it with `target`, and moves the Gaussians that were blended by one step of Adam.
+    pub fn step(
+        &mut self,
+        rasterizer: &mut Rasterizer,
+        cloud: &GpuCloud,
+        camera: &ViewCamera,
+        target: &TargetImage,
+        (loss, adam): (&LossConfig, &AdamConfig),
+    ) -> Result<StepReport, GpuError> {
+        let gpu = rasterizer.gpu().clone();
+        let adam = GpuBuffer::uniform(&gpu, "Adam", &AdamSetup::from(adam))?;
+        let counts = self.run(rasterizer, cloud, camera, [0.0; 3], &Objective::Image(target, loss), &Sink::Adam(&adam))?;
+        Ok(StepReport { loss: self.read_loss(&gpu, target)?, counts })
+    }
+
+    /// The same, but returns the gradients and moves nothing.
+    pub fn gradients(
+        &mut self,
+        rasterizer: &mut Rasterizer,
+        cloud: &GpuCloud,
+        camera: &ViewCamera,
+        target: &TargetImage,
+        loss: &LossConfig,
+    ) -> Result<Gradients, GpuError> {
+        let gpu = rasterizer.gpu().clone();
+        let mut gradients = self.collect(rasterizer, cloud, camera, [0.0; 3], &Objective::Image(target, loss))?;
+        gradients.loss = self.read_loss(&gpu, target)?;
+        Ok(gradients)
+    }
+
+    /// Gradients of any loss, from its gradients by the image: `[H, W]` (r, g, b, Σ w z) and alpha.
+    pub fn gradients_from_image(
+        &mut self,
+        rasterizer: &mut Rasterizer,
+        cloud: &GpuCloud,
+        camera: &ViewCamera,
+        background: [f32; 3],
+        (by_color_depth, by_alpha): (&[[f32; 4]], &[f32]),
+    ) -> Result<Gradients, GpuError> {
+        let gpu = rasterizer.gpu().clone();
+        self.reserve(&gpu, &View::new(camera, background), cloud)?;
+        self.image_gradients.write(&gpu, 0, by_color_depth);
+        let alpha: Vec<[f32; 4]> = by_alpha.iter().map(|a| [*a, 0.0, 0.0, 0.0]).collect();
+        self.image_gradients.write(&gpu, by_color_depth.len(), &alpha);
+        self.collect(rasterizer, cloud, camera, background, &Objective::Given)
+    }
+
+    fn collect(
+        &mut self,
+        rasterizer: &mut Rasterizer,
+        cloud: &GpuCloud,
+        camera: &ViewCamera,
+        background: [f32; 3],
+        objective: &Objective<'_>,
+    ) -> Result<Gradients, GpuError> {
+        let gpu = rasterizer.gpu().clone();
+        let sink = GpuBuffer::storage(&gpu, "gradients", cloud.parameters().raw().size())?;
+        self.run(rasterizer, cloud, camera, background, objective, &Sink::Gradient(&sink))?;
+        let planes = (0..cloud.planes())
+            .map(|plane| sink.read(&gpu, plane * cloud.capacity(), cloud.len()))
+            .collect::<Result<Vec<_>, _>>()?;
+        let pose: Vec<[f32; 4]> = self.pose_gradient.read(&gpu, 0, 2)?;
+        let pose = [pose[0][0], pose[0][1], pose[0][2], pose[1][0], pose[1][1], pose[1][2]];
+        Ok(Gradients { loss: LossTerms::default(), cloud: cloud_from_planes(cloud.sh_degree(), &planes), pose })
+    }
+
+    /// Submits the step, again with larger buffers if its pairs did not fit.
+    fn run(
+        &mut self,
+        rasterizer: &mut Rasterizer,
+        cloud: &GpuCloud,
+        camera: &ViewCamera,
+        background: [f32; 3],
+        objective: &Objective<'_>,
+        sink: &Sink<'_>,
+    ) -> Result<ViewCounts, GpuError> {
+        let gpu = rasterizer.gpu().clone();
+        loop {
+            let prepared = rasterizer.prepare(cloud, camera, background)?;
+            self.reserve(&gpu, &prepared.view, cloud)?;
+            let mut encoder = gpu.device.create_command_encoder(&Default::default());
+            rasterizer.encode_clear(&mut encoder);
+            if let Sink::Gradient(buffer) = sink {
+                encoder.clear_buffer(buffer.raw(), 0, None);
+            }
+            {
+                let mut pass = encoder.begin_compute_pass(&Default::default());
+                rasterizer.encode_forward(&mut pass, cloud, &prepared)?;
+                if let Objective::Image(target, loss) = objective {
+                    self.encode_loss(&mut pass, rasterizer, target, loss)?;
+                }
+                self.encode_backward(&mut pass, rasterizer, cloud, &prepared, sink);
+            }
+            gpu.queue.submit([encoder.finish()]);
+            if let Some(counts) = rasterizer.finish()? {
+                return Ok(counts);
+            }
+        }
+    }
+
+    fn encode_loss(
+        &self,
+        pass: &mut wgpu::ComputePass<'_>,
+        rasterizer: &Rasterizer,
+        target: &TargetImage,
+        loss: &LossConfig,
+    ) -> Result<(), GpuError> {
+        let (gpu, ws, k) = (rasterizer.gpu(), &rasterizer.workspace, &self.kernels);
+        let (width, height) = (target.width, target.height);
+        let setup = LossSetup { width, height, ssim_weight: loss.ssim_weight, depth_weight: loss.depth_weight };
+        let setup = GpuBuffer::uniform(gpu, "loss setup", &setup)?;
+        let size = [width.div_ceil(LOSS_TILE), height.div_ceil(LOSS_TILE), 1];
+        let inputs =
+            [(0, &setup), (1, &ws.color_depth), (2, &ws.state), (3, &target.color), (4, &target.depth), (5, &self.partials)];
+        let with = |last| inputs.iter().copied().chain([last]).collect::<Vec<_>>();
+        k.loss_forward.dispatch(gpu, pass, &with((6, &self.loss_sums)), size);
+        k.loss_reduce.dispatch(gpu, pass, &[(0, &self.loss_sums), (1, &self.loss_total)], [1, 1, 1]);
+        k.loss_backward.dispatch(gpu, pass, &with((6, &self.image_gradients)), size);
+        Ok(())
+    }
+
+    fn encode_backward(
+        &self,
+        pass: &mut wgpu::ComputePass<'_>,
+        rasterizer: &Rasterizer,
+        cloud: &GpuCloud,
+        prepared: &PreparedView,
+        sink: &Sink<'_>,
+    ) {
+        let (gpu, ws, k) = (rasterizer.gpu(), &rasterizer.workspace, &self.kernels);
+        let blend = [
+            (0, &prepared.uniform),
+            (1, &ws.ranges),
+            (2, &ws.slots[prepared.sorted]),
+            (3, &ws.slot_gaussians),
+            (4, &ws.projected),
+            (5, &ws.color_depth),
+            (6, &ws.state),
+            (7, &self.image_gradients),
+            (8, &ws.pair_gradients),
+        ];
+        k.rasterize_backward.dispatch(gpu, pass, &blend, workgroups(prepared.view.tiles()));
+        let mut project = vec![
+            (0, &prepared.uniform),
+            (1, &ws.counters),
+            (2, &ws.order[0]),
+            (3, &ws.pair_offsets),
+            (4, &ws.pair_gradients),
+            (5, &self.pose_sums),
+            (6, cloud.parameters()),
+        ];
+        let arguments = (&ws.counters, Counter::per_element_offset(VISIBLE_COUNTER));
+        let kernel = match sink {
+            Sink::Adam(setup) => {
+                project.extend([(7, cloud.moments_1()), (8, cloud.moments_2()), (9, *setup)]);
+                &k.project_backward_adam
+            }
+            Sink::Gradient(buffer) => {
+                project.push((7, *buffer));
+                &k.project_backward
+            }
+        };
+        kernel.dispatch_indirect(gpu, pass, &project, arguments);
+        let reduce = [(0, &ws.counters), (1, &self.pose_sums), (2, &self.pose_gradient)];
+        k.pose_reduce.dispatch(gpu, pass, &reduce, [1, 1, 1]);
+    }
+
+    fn read_loss(&self, gpu: &Gpu, target: &TargetImage) -> Result<LossTerms, GpuError> {
+        let total: Vec<[f32; 4]> = self.loss_total.read(gpu, 0, 1)?;
+        Ok(LossTerms::from_sums(total[0], target.width * target.height))
+    }
+
+    fn reserve(&mut self, gpu: &Gpu, view: &View, cloud: &GpuCloud) -> Result<(), GpuError> {
+        if view.pixels() != self.pixels {
+            let pixels = u64::from(view.pixels());
+            let blocks = u64::from(view.width.div_ceil(LOSS_TILE) * view.height.div_ceil(LOSS_TILE));
+            self.partials = GpuBuffer::storage(gpu, "loss partials", pixels * 48)?;
+            self.image_gradients = GpuBuffer::storage(gpu, "image gradients", pixels * 32)?;
+            // Its length is the number of terms that are summed.
+            self.loss_sums = GpuBuffer::storage(gpu, "loss sums", blocks * 16)?;
+            self.pixels = view.pixels();
+        }
+        if cloud.capacity() > self.gaussians {
+            self.pose_sums = GpuBuffer::storage(gpu, "pose sums", (cloud.capacity() as u64).div_ceil(256) * 32)?;
+            self.gaussians = cloud.capacity();
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,28 @@
+//! One Adam step (Kingma & Ba 2015) on a row of numbers; twin of `shaders/shared/sink_adam.wgsl`.
+
+/// Moments and step count of one Gaussian.
+#[derive(Clone, Debug, Default)]
+pub struct Adam64 {
+    pub first: Vec<f64>,
+    pub second: Vec<f64>,
+    pub steps: i32,
+}
+
+impl Adam64 {
+    /// Moves `parameters` by `gradient`; a gradient that is zero throughout moves nothing and counts no step.
+    pub fn step(&mut self, parameters: &mut [f64], gradient: &[f64], rates: &[f64], (beta_1, beta_2, epsilon): (f64, f64, f64)) {
+        if gradient.iter().all(|g| *g == 0.0) {
+            return;
+        }
+        self.first.resize(parameters.len(), 0.0);
+        self.second.resize(parameters.len(), 0.0);
+        self.steps += 1;
+        for i in 0..parameters.len() {
+            self.first[i] = beta_1 * self.first[i] + (1.0 - beta_1) * gradient[i];
+            self.second[i] = beta_2 * self.second[i] + (1.0 - beta_2) * gradient[i] * gradient[i];
+            let m = self.first[i] / (1.0 - beta_1.powi(self.steps));
+            let v = self.second[i] / (1.0 - beta_2.powi(self.steps));
+            parameters[i] -= rates[i] * m / (v.sqrt() + epsilon);
+        }
+    }
+}

@@ -1,0 +1,100 @@
+//! Gradient through the projection to the raw parameters and the camera pose; twin of `shaders/project_backward.wgsl`, in matrices.
+
+use nalgebra::{Matrix2, Matrix2x3, Matrix3, Vector2, Vector3, Vector4, Vector6};
+
+use super::project_forward::{Projected64, camera_rotation, rotation_matrix};
+use super::rasterize_backward;
+use super::rasterize_forward::sorted;
+use super::{Gaussian64, ImageGradient64, ProjectedGradient, View64, spherical_harmonics};
+
+/// Gradient of a loss by everything that a rendered view depends on.
+#[derive(Clone, Debug)]
+pub struct Gradient64 {
+    /// By each Gaussian of the map; zero where it was not drawn.
+    pub cloud: Vec<Gaussian64>,
+    /// By the pose, τ = (ρ, θ) of `camera_from_world ← Exp(τ)·camera_from_world`.
+    pub pose: Vector6<f64>,
+}
+
+/// The whole backward pass, from the image's gradient to the parameters' and the pose's.
+pub fn backward(view: &View64, cloud: &[Gaussian64], by_image: &ImageGradient64) -> Gradient64 {
+    let sorted = sorted(view, cloud);
+    let by_projected = rasterize_backward::backward(view, &sorted, by_image);
+    let zero = |g: &Gaussian64| Gaussian64::from_flat(&vec![0.0; g.flat().len()]);
+    let mut gradient = Gradient64 { cloud: cloud.iter().map(zero).collect(), pose: Vector6::zeros() };
+    for ((i, projected), by) in sorted.iter().zip(&by_projected) {
+        let (own, pose) = project_backward(view, &cloud[*i], projected, by);
+        gradient.cloud[*i] = own;
+        gradient.pose += pose;
+    }
+    gradient
+}
+
+fn project_backward(view: &View64, g: &Gaussian64, f: &Projected64, by: &ProjectedGradient) -> (Gaussian64, Vector6<f64>) {
+    let rotation = camera_rotation(view);
+    // Σ⁻¹ = P: dΣ = -P⁻¹dP P⁻¹, hence ∂L/∂Σ = -P G P with G symmetric.
+    let by_conic = Matrix2::new(by.conic.x, by.conic.y / 2.0, by.conic.y / 2.0, by.conic.z);
+    let by_covariance = -(f.conic * by_conic * f.conic);
+    let by_t: Matrix2x3<f64> = 2.0 * by_covariance * (f.jacobian * f.axes);
+    let by_jacobian = by_t * f.axes.transpose();
+    let by_axes: Matrix3<f64> = f.jacobian.transpose() * by_t;
+
+    let by_point = by_point(view, f, by, &by_jacobian);
+    let free = by.color.zip_map(&f.unclamped_color, |b, c| if c > 0.0 { b } else { 0.0 });
+    let by_direction: Vector3<f64> =
+        g.sh.iter().enumerate().map(|(k, c)| spherical_harmonics::basis_gradient(k, &f.direction) * c.dot(&free)).sum();
+    let by_mean_of_color = (by_direction - f.direction * f.direction.dot(&by_direction)) / f.distance;
+
+    let q = g.rotation.normalize();
+    let scale = g.log_scale.map(f64::exp);
+    let by_axes_in_world = rotation.transpose() * by_axes;
+    let by_rotation = by_axes_in_world * Matrix3::from_diagonal(&scale);
+    let by_unit = quaternion_gradient(&q, &by_rotation);
+    let world_axes = rotation_matrix(&q) * Matrix3::from_diagonal(&scale);
+    let own = Gaussian64 {
+        mean: rotation.transpose() * by_point + by_mean_of_color,
+        log_scale: Vector3::from_fn(|k, _| by_axes_in_world.column(k).dot(&world_axes.column(k))),
+        rotation: (by_unit - q * q.dot(&by_unit)) / g.rotation.norm(),
+        raw_opacity: by.opacity * f.opacity * (1.0 - f.opacity),
+        sh: (0..g.sh.len()).map(|k| free * spherical_harmonics::basis(k, &f.direction)).collect(),
+    };
+    let rho = by_point + rotation * by_mean_of_color;
+    // Σc' = Exp(θ)Σc Exp(-θ): with Q = 2ΣcM, M = JᵀGJ, its gradient is the vector of Q - Qᵀ.
+    let in_camera = 2.0 * f.axes * f.axes.transpose() * f.jacobian.transpose() * by_covariance * f.jacobian;
+    let by_turn = Vector3::new(
+        in_camera[(1, 2)] - in_camera[(2, 1)],
+        in_camera[(2, 0)] - in_camera[(0, 2)],
+        in_camera[(0, 1)] - in_camera[(1, 0)],
+    );
+    let theta = f.p_in_camera.cross(&by_point) + by_turn;
+    (own, Vector6::new(rho.x, rho.y, rho.z, theta.x, theta.y, theta.z))
+}
+
+/// Through the image mean, the depth, and J's dependence on the mean (its own z, and x/z, y/z where these were not clamped).
+fn by_point(view: &View64, f: &Projected64, by: &ProjectedGradient, by_jacobian: &Matrix2x3<f64>) -> Vector3<f64> {
+    let p = &view.camera.pinhole;
+    let (x, y, z) = (f.p_in_camera.x, f.p_in_camera.y, f.p_in_camera.z);
+    let projection = Matrix2x3::new(p.fx / z, 0.0, -p.fx * x / (z * z), 0.0, p.fy / z, -p.fy * y / (z * z));
+    let mut by_point = projection.transpose() * by.mean;
+    by_point.z += by.depth;
+    let tangent = Vector2::new(-f.jacobian[(0, 2)] * z / p.fx, -f.jacobian[(1, 2)] * z / p.fy);
+    for (row, focal) in [(0, p.fx), (1, p.fy)] {
+        by_point.z -= by_jacobian[(row, row)] * focal / (z * z);
+        let by_slope = -focal * by_jacobian[(row, 2)];
+        by_point[row] += by_slope * f.inside[row] / (z * z);
+        by_point.z -= by_slope * tangent[row] * (1.0 + f.inside[row]) / (z * z);
+    }
+    by_point
+}
+
+/// By the unit quaternion (w, x, y, z), from the gradient by the rotation matrix.
+fn quaternion_gradient(q: &Vector4<f64>, by_rotation: &Matrix3<f64>) -> Vector4<f64> {
+    let (w, x, y, z) = (q[0], q[1], q[2], q[3]);
+    let derivatives = [
+        Matrix3::new(0.0, -z, y, z, 0.0, -x, -y, x, 0.0),
+        Matrix3::new(0.0, y, z, y, -2.0 * x, -w, z, w, -2.0 * x),
+        Matrix3::new(-2.0 * y, x, w, x, 0.0, z, -w, z, -2.0 * y),
+        Matrix3::new(-2.0 * z, -w, x, w, -2.0 * z, y, x, y, 0.0),
+    ];
+    Vector4::from_fn(|i, _| 2.0 * derivatives[i].dot(by_rotation))
+}

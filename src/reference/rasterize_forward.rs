@@ -1,0 +1,66 @@
+//! Front-to-back blending, every Gaussian at every pixel; twin of `shaders/rasterize_forward.wgsl`.
+
+use nalgebra::{Vector2, Vector3};
+
+use super::project_forward::{Projected64, project};
+use super::{Cutoffs, Gaussian64, Image64, View64};
+use crate::render::layout;
+
+/// The projected Gaussians with their indices, nearest first; ties keep the order of the map.
+pub fn sorted(view: &View64, cloud: &[Gaussian64]) -> Vec<(usize, Projected64)> {
+    let mut visible: Vec<_> = cloud.iter().enumerate().filter_map(|(i, g)| Some((i, project(view, g)?))).collect();
+    // The GPU's keys are f32.
+    visible.sort_by(|a, b| (a.1.depth as f32).total_cmp(&(b.1.depth as f32)));
+    visible
+}
+
+/// How a Gaussian acts on one pixel.
+pub(super) struct Contribution {
+    pub index: usize,
+    pub alpha: f64,
+    /// Whether alpha is at its cap and no longer depends on shape and opacity.
+    pub capped: bool,
+    /// Pixel minus mean.
+    pub offset: Vector2<f64>,
+    /// Transmittance in front of it.
+    pub transmittance: f64,
+}
+
+/// All contributions to the pixel `(x, y)`, front to back, and the transmittance left.
+pub(super) fn contributions(view: &View64, sorted: &[(usize, Projected64)], x: u32, y: u32) -> (Vec<Contribution>, f64) {
+    let mut transmittance = 1.0;
+    let mut found = Vec::new();
+    for (index, (_, g)) in sorted.iter().enumerate() {
+        let offset = Vector2::new(f64::from(x), f64::from(y)) - g.mean;
+        let power = -0.5 * (offset.transpose() * g.conic * offset)[0];
+        if view.cutoffs == Cutoffs::Sharp && power + g.cut < 0.0 {
+            continue;
+        }
+        let raw = g.opacity * power.exp();
+        let alpha = raw.min(layout::ALPHA_MAX);
+        let next = transmittance * (1.0 - alpha);
+        if view.cutoffs == Cutoffs::Sharp && next < layout::TRANSMITTANCE_MIN {
+            break;
+        }
+        found.push(Contribution { index, alpha, capped: raw > layout::ALPHA_MAX, offset, transmittance });
+        transmittance = next;
+    }
+    (found, transmittance)
+}
+
+/// Renders the map.
+pub fn render(view: &View64, cloud: &[Gaussian64]) -> Image64 {
+    let sorted = sorted(view, cloud);
+    let p = &view.camera.pinhole;
+    let mut image = Image64 { color: Vec::new(), depth: Vec::new(), transmittance: Vec::new() };
+    for (x, y) in (0..p.height).flat_map(|y| (0..p.width).map(move |x| (x, y))) {
+        let (found, transmittance) = contributions(view, &sorted, x, y);
+        let weighted = |f: &dyn Fn(&Projected64) -> Vector3<f64>| -> Vector3<f64> {
+            found.iter().map(|c| f(&sorted[c.index].1) * (c.alpha * c.transmittance)).sum()
+        };
+        image.color.push(weighted(&|g| g.color) + view.background * transmittance);
+        image.depth.push(weighted(&|g| Vector3::new(g.depth, 0.0, 0.0)).x);
+        image.transmittance.push(transmittance);
+    }
+    image
+}

@@ -1,0 +1,179 @@
+//! The map's Gaussians on the GPU: parameters and Adam moments in planes of vec4.
+
+use glam::{Quat, Vec3};
+
+use super::layout::GEOMETRY_PLANES;
+use super::shaders;
+use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, workgroups};
+use crate::splat::{GaussianCloud, ShDegree};
+
+/// Gaussians on the GPU, `[planes, capacity]` vec4 in each buffer. Plane 0 holds position and raw opacity, 1 the log scale,
+/// 2 the rotation (w, x, y, z), 3 the constant colour, 4… the other harmonics, RGB each.
+#[derive(Debug)]
+pub struct GpuCloud {
+    sh_degree: ShDegree,
+    count: usize,
+    capacity: usize,
+    parameters: GpuBuffer,
+    moments_1: GpuBuffer,
+    moments_2: GpuBuffer,
+    gather: Kernel,
+}
+
+#[repr(C)]
+#[derive(Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+struct GatherSetup {
+    count: u32,
+    planes: u32,
+    capacity_in: u32,
+    capacity_out: u32,
+}
+
+impl GpuCloud {
+    /// An empty map with room for `capacity` Gaussians; it grows as needed.
+    pub fn new(gpu: &Gpu, sh_degree: ShDegree, capacity: usize) -> Result<Self, GpuError> {
+        let capacity = capacity.max(256);
+        let [parameters, moments_1, moments_2] = allocate(gpu, sh_degree, capacity)?;
+        let gather = Kernel::new(gpu, "gather", "main", &shaders::GATHER.text());
+        Ok(Self { sh_degree, count: 0, capacity, parameters, moments_1, moments_2, gather })
+    }
+
+    pub fn len(&self) -> usize {
+        self.count
+    }
+
+    pub fn is_empty(&self) -> bool {
+        self.count == 0
+    }
+
+    pub fn capacity(&self) -> usize {
+        self.capacity
+    }
+
+    pub fn sh_degree(&self) -> ShDegree {
+        self.sh_degree
+    }
+
+    /// Number of vec4 planes in each buffer.
+    pub fn planes(&self) -> usize {
+        planes(self.sh_degree)
+    }
+
+    pub fn parameters(&self) -> &GpuBuffer {
+        &self.parameters
+    }
+
+    pub fn moments_1(&self) -> &GpuBuffer {
+        &self.moments_1
+    }
+
+    pub fn moments_2(&self) -> &GpuBuffer {
+        &self.moments_2
+    }
+
+    /// Appends Gaussians with zero moments. Those that hold a NaN or an infinity are left out; their number is returned.
+    pub fn append(&mut self, gpu: &Gpu, cloud: &GaussianCloud) -> Result<usize, GpuError> {
+        assert_eq!(cloud.sh_degree, self.sh_degree, "a map has one spherical-harmonics degree");
+        let finite: Vec<usize> = (0..cloud.len()).filter(|&i| is_finite(cloud, i)).collect();
+        if self.count + finite.len() > self.capacity {
+            let grown = (self.count + finite.len()).next_power_of_two();
+            let all: Vec<u32> = (0..self.count as u32).collect();
+            self.rebuild(gpu, &all, grown)?;
+        }
+        let zeros = vec![[0.0f32; 4]; finite.len()];
+        for plane in 0..self.planes() {
+            let values: Vec<[f32; 4]> = finite.iter().map(|&i| plane_value(cloud, plane, i)).collect();
+            let first = plane * self.capacity + self.count;
+            self.parameters.write(gpu, first, &values);
+            self.moments_1.write(gpu, first, &zeros);
+            self.moments_2.write(gpu, first, &zeros);
+        }
+        self.count += finite.len();
+        Ok(cloud.len() - finite.len())
+    }
+
+    /// Keeps the Gaussians at `chosen` (ascending indices), parameters and moments together.
+    pub fn keep(&mut self, gpu: &Gpu, chosen: &[u32]) -> Result<(), GpuError> {
+        if chosen.len() == self.count { Ok(()) } else { self.rebuild(gpu, chosen, self.capacity) }
+    }
+
+    fn rebuild(&mut self, gpu: &Gpu, chosen: &[u32], capacity: usize) -> Result<(), GpuError> {
+        let [parameters, moments_1, moments_2] = allocate(gpu, self.sh_degree, capacity)?;
+        let list = GpuBuffer::storage(gpu, "chosen", (chosen.len() * 4) as u64)?;
+        list.write(gpu, 0, chosen);
+        let setup = GatherSetup {
+            count: chosen.len() as u32,
+            planes: self.planes() as u32,
+            capacity_in: self.capacity as u32,
+            capacity_out: capacity as u32,
+        };
+        let setup = GpuBuffer::uniform(gpu, "gather setup", &setup)?;
+        let mut encoder = gpu.device.create_command_encoder(&Default::default());
+        {
+            let mut pass = encoder.begin_compute_pass(&Default::default());
+            let size = workgroups((chosen.len() as u32).div_ceil(256));
+            for (from, to) in [(&self.parameters, &parameters), (&self.moments_1, &moments_1), (&self.moments_2, &moments_2)] {
+                self.gather.dispatch(gpu, &mut pass, &[(0, &setup), (1, &list), (2, from), (3, to)], size);
+            }
+        }
+        gpu.queue.submit([encoder.finish()]);
+        (self.parameters, self.moments_1, self.moments_2) = (parameters, moments_1, moments_2);
+        (self.count, self.capacity) = (chosen.len(), capacity);
+        Ok(())
+    }
+
+    /// Reads one plane of the parameters, `[count]`.
+    pub fn read_plane(&self, gpu: &Gpu, plane: usize) -> Result<Vec<[f32; 4]>, GpuError> {
+        self.parameters.read(gpu, plane * self.capacity, self.count)
+    }
+
+    /// Reads the whole map.
+    pub fn download(&self, gpu: &Gpu) -> Result<GaussianCloud, GpuError> {
+        let read = (0..self.planes()).map(|plane| self.read_plane(gpu, plane)).collect::<Result<Vec<_>, _>>()?;
+        Ok(cloud_from_planes(self.sh_degree, &read))
+    }
+}
+
+/// Number of vec4 planes for a degree.
+pub fn planes(sh_degree: ShDegree) -> usize {
+    GEOMETRY_PLANES + sh_degree.coefficients()
+}
+
+/// A cloud from its planes, each `[N]`; also reads gradients, which have the same layout.
+pub fn cloud_from_planes(sh_degree: ShDegree, read: &[Vec<[f32; 4]>]) -> GaussianCloud {
+    let xyz = |v: &[f32; 4]| Vec3::new(v[0], v[1], v[2]);
+    let count = read[0].len();
+    let coefficients = &read[GEOMETRY_PLANES..];
+    GaussianCloud {
+        sh_degree,
+        means: read[0].iter().map(xyz).collect(),
+        raw_opacities: read[0].iter().map(|v| v[3]).collect(),
+        log_scales: read[1].iter().map(xyz).collect(),
+        rotations: read[2].iter().map(|v| Quat::from_xyzw(v[1], v[2], v[3], v[0])).collect(),
+        sh: (0..count).flat_map(|i| coefficients.iter().map(move |plane| xyz(&plane[i]))).collect(),
+    }
+}
+
+fn plane_value(cloud: &GaussianCloud, plane: usize, i: usize) -> [f32; 4] {
+    let with = |v: Vec3, w: f32| [v.x, v.y, v.z, w];
+    let q = cloud.rotations[i];
+    match plane {
+        0 => with(cloud.means[i], cloud.raw_opacities[i]),
+        1 => with(cloud.log_scales[i], 0.0),
+        2 => [q.w, q.x, q.y, q.z],
+        _ => with(cloud.sh[i * cloud.sh_degree.coefficients() + plane - GEOMETRY_PLANES], 0.0),
+    }
+}
+
+fn is_finite(cloud: &GaussianCloud, i: usize) -> bool {
+    (0..planes(cloud.sh_degree)).all(|plane| plane_value(cloud, plane, i).iter().all(|v| v.is_finite()))
+}
+
+fn allocate(gpu: &Gpu, sh_degree: ShDegree, capacity: usize) -> Result<[GpuBuffer; 3], GpuError> {
+    let bytes = (planes(sh_degree) * capacity * 16) as u64;
+    Ok([
+        GpuBuffer::storage(gpu, "Gaussian parameters", bytes)?,
+        GpuBuffer::storage(gpu, "first moments", bytes)?,
+        GpuBuffer::storage(gpu, "second moments", bytes)?,
+    ])
+}

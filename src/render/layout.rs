@@ -1,0 +1,163 @@
+//! What host and shaders must agree on: constants (this file is their one source) and the layouts of shared structs.
+
+use bytemuck::{Pod, Zeroable};
+use nalgebra::Vector3;
+
+use crate::geometry::{Pinhole, Se3};
+
+/// A tile is 16×16 pixels: 64 invocations with a 2×2 quad each.
+pub const TILE_WIDTH: u32 = 16;
+pub const TILE_HEIGHT: u32 = 16;
+/// Elements that one workgroup scans, and keys that one workgroup sorts.
+pub const SCAN_BLOCK: u32 = 2048;
+pub const SORT_BLOCK: u32 = 2048;
+/// Alpha below which a Gaussian does not touch a pixel: half a step of an 8-bit image, as in 3DGS.
+pub const ALPHA_MIN: f64 = 1.0 / 255.0;
+/// Alpha never exceeds this, so that 1 - α stays invertible.
+pub const ALPHA_MAX: f64 = 0.99;
+/// A pixel is finished before its transmittance would fall below this.
+pub const TRANSMITTANCE_MIN: f64 = 1e-4;
+/// Gaussians nearer than this (their projection blows up) or farther than that are not drawn, metres.
+pub const NEAR_METRES: f64 = 0.05;
+pub const FAR_METRES: f64 = 1e5;
+/// Added to the image covariance's diagonal, pixels²: the footprint of a pixel (3DGS).
+pub const DILATION: f64 = 0.3;
+pub const MIN_DETERMINANT: f64 = 1e-6;
+pub const MIN_QUATERNION_NORM_SQUARED: f64 = 1e-8;
+/// How far beyond the image's edge, as a share of its size, the Jacobian follows x/z and y/z.
+pub const TANGENT_MARGIN: f64 = 0.15;
+
+/// Counters in the counter buffer.
+pub const VISIBLE_COUNTER: u32 = 0;
+pub const PAIR_COUNTER: u32 = 1;
+pub const COUNTERS: u32 = 2;
+
+/// Planes of vec4 that precede the higher harmonics: (position, raw opacity), (log scale, -), rotation (w, x, y, z), (constant colour, -).
+pub const GEOMETRY_PLANES: usize = 3;
+
+/// The constants above as WGSL, put before every shader.
+pub fn wgsl_constants() -> String {
+    let floats = [
+        ("ALPHA_MIN", ALPHA_MIN),
+        ("ALPHA_MAX", ALPHA_MAX),
+        ("TRANSMITTANCE_MIN", TRANSMITTANCE_MIN),
+        ("NEAR_METRES", NEAR_METRES),
+        ("FAR_METRES", FAR_METRES),
+        ("DILATION", DILATION),
+        ("MIN_DETERMINANT", MIN_DETERMINANT),
+        ("MIN_QUATERNION_NORM_SQUARED", MIN_QUATERNION_NORM_SQUARED),
+    ];
+    let integers = [
+        ("TILE_WIDTH", TILE_WIDTH),
+        ("TILE_HEIGHT", TILE_HEIGHT),
+        ("SCAN_BLOCK", SCAN_BLOCK),
+        ("SORT_BLOCK", SORT_BLOCK),
+        ("VISIBLE_COUNTER", VISIBLE_COUNTER),
+        ("PAIR_COUNTER", PAIR_COUNTER),
+    ];
+    let floats = floats.iter().map(|(name, value)| format!("const {name}: f32 = {value:e};\n"));
+    let integers = integers.iter().map(|(name, value)| format!("const {name}: u32 = {value}u;\n"));
+    floats.chain(integers).collect()
+}
+
+/// A camera to render from.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ViewCamera {
+    pub pinhole: Pinhole,
+    pub camera_from_world: Se3,
+}
+
+/// Host twin of `View` in `shaders/shared/view.wgsl`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+pub struct View {
+    pub camera_rows: [[f32; 4]; 3],
+    pub center_in_world: [f32; 4],
+    pub intrinsics: [f32; 4],
+    pub tangent_bounds: [f32; 4],
+    pub background: [f32; 4],
+    pub width: u32,
+    pub height: u32,
+    pub tiles_x: u32,
+    pub tiles_y: u32,
+    pub gaussian_count: u32,
+    pub capacity: u32,
+    pub sh_degree: u32,
+    pub pair_capacity: u32,
+}
+
+/// The bounds min x, max x, min y, max y on x/z and y/z inside the projection's Jacobian.
+pub fn tangent_bounds(p: &Pinhole) -> [f64; 4] {
+    let (w, h) = (f64::from(p.width), f64::from(p.height));
+    let (mx, my) = (TANGENT_MARGIN * w, TANGENT_MARGIN * h);
+    [(-mx - p.cx) / p.fx, (w + mx - p.cx) / p.fx, (-my - p.cy) / p.fy, (h + my - p.cy) / p.fy]
+}
+
+impl View {
+    /// The view's constants; what depends on the map is filled in when it is rendered.
+    pub fn new(camera: &ViewCamera, background: [f32; 3]) -> Self {
+        let p = &camera.pinhole;
+        let rotation = camera.camera_from_world.rotation.to_rotation_matrix();
+        let translation = camera.camera_from_world.translation.vector;
+        let center: Vector3<f64> = -(rotation.inverse() * translation);
+        let row = |r: usize| [rotation[(r, 0)] as f32, rotation[(r, 1)] as f32, rotation[(r, 2)] as f32, translation[r] as f32];
+        Self {
+            camera_rows: [row(0), row(1), row(2)],
+            center_in_world: [center.x as f32, center.y as f32, center.z as f32, 0.0],
+            intrinsics: [p.fx as f32, p.fy as f32, p.cx as f32, p.cy as f32],
+            tangent_bounds: tangent_bounds(p).map(|v| v as f32),
+            background: [background[0], background[1], background[2], 0.0],
+            width: p.width,
+            height: p.height,
+            tiles_x: p.width.div_ceil(TILE_WIDTH),
+            tiles_y: p.height.div_ceil(TILE_HEIGHT),
+            gaussian_count: 0,
+            capacity: 0,
+            sh_degree: 0,
+            pair_capacity: 0,
+        }
+    }
+
+    pub fn tiles(&self) -> u32 {
+        self.tiles_x * self.tiles_y
+    }
+
+    pub fn pixels(&self) -> u32 {
+        self.width * self.height
+    }
+}
+
+/// Host twin of `Counter` in `shaders/shared/counters.wgsl`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, Pod, Zeroable)]
+pub struct Counter {
+    pub count: u32,
+    pub needed: u32,
+    pub per_element: [u32; 3],
+    pub per_block: [u32; 3],
+}
+
+impl Counter {
+    const SIZE: u64 = std::mem::size_of::<Self>() as u64;
+
+    /// Byte offset of a counter's indirect arguments with one invocation an element.
+    pub const fn per_element_offset(counter: u32) -> u64 {
+        counter as u64 * Self::SIZE + 8
+    }
+
+    /// Byte offset of a counter's indirect arguments with one workgroup per sort block.
+    pub const fn per_block_offset(counter: u32) -> u64 {
+        counter as u64 * Self::SIZE + 20
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn indirect_offsets_point_into_the_struct() {
+        assert_eq!(std::mem::offset_of!(Counter, per_element) as u64, Counter::per_element_offset(0));
+        assert_eq!(std::mem::offset_of!(Counter, per_block) as u64 + 32, Counter::per_block_offset(1));
+    }
+}

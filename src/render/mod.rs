@@ -1,0 +1,14 @@
+//! The differentiable rasterizer's host side: projection, tile lists, sorting, blending, forward and backward.
+
+mod cloud;
+pub mod layout;
+mod rasterizer;
+pub(crate) mod shaders;
+mod sort;
+mod workspace;
+
+pub use cloud::{GpuCloud, cloud_from_planes};
+pub use layout::ViewCamera;
+pub use rasterizer::{PreparedView, Rasterizer, Rendered, ViewCounts};
+pub use shaders::{SHADERS, ShaderSource};
+pub use workspace::Workspace;

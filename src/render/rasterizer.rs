@@ -1,0 +1,237 @@
+//! Encodes the forward pass: project, compact, depth sort, tile lists, tile sort, blend.
+//!
+//! Nothing is read back in between: counts stay on the GPU and later dispatches take their size from them. When the pairs outgrow
+//! their buffers, the GPU renders nothing and says how many there are; the caller grows the buffers and repeats the step.
+
+use std::sync::Arc;
+
+use bytemuck::{Pod, Zeroable};
+
+use super::cloud::GpuCloud;
+use super::layout::{COUNTERS, Counter, PAIR_COUNTER, VISIBLE_COUNTER, View, ViewCamera};
+use super::shaders;
+use super::sort::{Scan, ScanJob, ScanLength, Sort};
+use super::workspace::Workspace;
+use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, workgroups};
+
+/// Depth keys are whole f32.
+const DEPTH_KEY_BITS: u32 = 32;
+
+/// A rendered view on the host.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Rendered {
+    pub width: u32,
+    pub height: u32,
+    /// `[H, W]` colour over the background, and Σ w z in metres.
+    pub color_depth: Vec<[f32; 4]>,
+    /// `[H, W]` share of light that reaches what lies behind the map; alpha is one minus it.
+    pub transmittance: Vec<f32>,
+}
+
+impl Rendered {
+    /// Expected depth at pixel `i`, metres; `None` where hardly anything was blended.
+    pub fn depth(&self, i: usize) -> Option<f32> {
+        let alpha = 1.0 - self.transmittance[i];
+        (alpha > 0.5).then(|| self.color_depth[i][3] / alpha)
+    }
+}
+
+/// Counts of a rendered view.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct ViewCounts {
+    pub visible: u32,
+    pub pairs: u32,
+}
+
+#[repr(C)]
+#[derive(Clone, Copy, Pod, Zeroable)]
+struct TileListsSetup {
+    emit: u32,
+    pad: [u32; 3],
+}
+
+#[derive(Debug)]
+struct Kernels {
+    project_forward: Kernel,
+    compact_visible: Kernel,
+    tile_lists: Kernel,
+    tile_ranges: Kernel,
+    rasterize_forward: Kernel,
+    scan: Scan,
+    sort: Sort,
+}
+
+/// The forward pass with its scratch buffers; the optimiser reads these for the backward pass.
+#[derive(Debug)]
+pub struct Rasterizer {
+    gpu: Arc<Gpu>,
+    kernels: Kernels,
+    count_mode: GpuBuffer,
+    emit_mode: GpuBuffer,
+    pub workspace: Workspace,
+}
+
+/// A view prepared for encoding: its uniform, and where the sorted pairs will lie.
+#[derive(Debug)]
+pub struct PreparedView {
+    pub view: View,
+    pub uniform: GpuBuffer,
+    /// Which of `workspace.slots` holds the sorted pairs.
+    pub sorted: usize,
+}
+
+impl Rasterizer {
+    pub fn new(gpu: Arc<Gpu>) -> Result<Self, GpuError> {
+        let kernel = |source: &shaders::ShaderSource| Kernel::new(&gpu, source.name, "main", &source.text());
+        let kernels = Kernels {
+            project_forward: kernel(&shaders::PROJECT_FORWARD),
+            compact_visible: kernel(&shaders::COMPACT_VISIBLE),
+            tile_lists: kernel(&shaders::TILE_LISTS),
+            tile_ranges: kernel(&shaders::TILE_RANGES),
+            rasterize_forward: kernel(&shaders::RASTERIZE_FORWARD),
+            scan: Scan::new(&gpu),
+            sort: Sort::new(&gpu),
+        };
+        gpu.check()?;
+        Ok(Self {
+            kernels,
+            count_mode: GpuBuffer::uniform(&gpu, "count mode", &TileListsSetup { emit: 0, pad: [0; 3] })?,
+            emit_mode: GpuBuffer::uniform(&gpu, "emit mode", &TileListsSetup { emit: 1, pad: [0; 3] })?,
+            workspace: Workspace::new(&gpu)?,
+            gpu,
+        })
+    }
+
+    pub fn gpu(&self) -> &Arc<Gpu> {
+        &self.gpu
+    }
+
+    /// Makes room for the view and writes its uniform.
+    pub fn prepare(&mut self, cloud: &GpuCloud, camera: &ViewCamera, background: [f32; 3]) -> Result<PreparedView, GpuError> {
+        let mut view = View::new(camera, background);
+        self.workspace.reserve_gaussians(&self.gpu, cloud.capacity())?;
+        self.workspace.reserve_image(&self.gpu, &view)?;
+        view.gaussian_count = cloud.len() as u32;
+        // All per-Gaussian buffers of the workspace are at least as long as the map's planes, whose stride both share.
+        view.capacity = cloud.capacity() as u32;
+        view.sh_degree = u32::from(cloud.sh_degree().get());
+        view.pair_capacity = self.workspace.pair_capacity as u32;
+        let tile_bits = u32::BITS - view.tiles().leading_zeros();
+        let uniform = GpuBuffer::uniform(&self.gpu, "view", &view)?;
+        Ok(PreparedView { view, uniform, sorted: (tile_bits.div_ceil(8) % 2) as usize })
+    }
+
+    /// Encodes what must precede the pass of [`Self::encode_forward`].
+    pub fn encode_clear(&self, encoder: &mut wgpu::CommandEncoder) {
+        encoder.clear_buffer(self.workspace.ranges.raw(), 0, None);
+        encoder.clear_buffer(self.workspace.counters.raw(), 0, None);
+    }
+
+    /// Encodes the forward pass.
+    pub fn encode_forward(
+        &self,
+        pass: &mut wgpu::ComputePass<'_>,
+        cloud: &GpuCloud,
+        prepared: &PreparedView,
+    ) -> Result<(), GpuError> {
+        let (gpu, ws, k) = (&*self.gpu, &self.workspace, &self.kernels);
+        let (view, uniform) = (&prepared.view, &prepared.uniform);
+        let count = view.gaussian_count;
+        let per_gaussian = workgroups(count.div_ceil(256));
+        let project = [(0, uniform), (1, cloud.parameters()), (2, &ws.projected), (3, &ws.visible)];
+        k.project_forward.dispatch(gpu, pass, &project, per_gaussian);
+        let job = ScanJob {
+            values: &ws.visible,
+            prefix: &ws.prefix,
+            length: ScanLength::Known(count),
+            counter_out: VISIBLE_COUNTER,
+            capacity: count,
+        };
+        k.scan.encode(gpu, pass, ws, &job)?;
+        let compact =
+            [(0, uniform), (1, &ws.visible), (2, &ws.prefix), (3, &ws.projected), (4, &ws.depth_keys[0]), (5, &ws.order[0])];
+        k.compact_visible.dispatch(gpu, pass, &compact, per_gaussian);
+        k.sort.encode(gpu, pass, ws, (&ws.depth_keys, &ws.order), (VISIBLE_COUNTER, DEPTH_KEY_BITS))?;
+        self.encode_tiles(pass, prepared)?;
+        let bindings = [
+            (0, uniform),
+            (1, &ws.ranges),
+            (2, &ws.slots[prepared.sorted]),
+            (3, &ws.slot_gaussians),
+            (4, &ws.projected),
+            (5, &ws.color_depth),
+            (6, &ws.state),
+        ];
+        k.rasterize_forward.dispatch(gpu, pass, &bindings, workgroups(view.tiles()));
+        Ok(())
+    }
+
+    /// Tile lists: count, offsets, emit, stable sort by tile, ranges.
+    fn encode_tiles(&self, pass: &mut wgpu::ComputePass<'_>, prepared: &PreparedView) -> Result<(), GpuError> {
+        let (gpu, ws, k) = (&*self.gpu, &self.workspace, &self.kernels);
+        let visible = (&ws.counters, Counter::per_element_offset(VISIBLE_COUNTER));
+        let lists = |mode| {
+            [
+                (0, &prepared.uniform),
+                (1, mode),
+                (2, &ws.counters),
+                (3, &ws.order[0]),
+                (4, &ws.projected),
+                (5, &ws.pair_counts),
+                (6, &ws.pair_offsets),
+                (7, &ws.tile_keys[0]),
+                (8, &ws.slots[0]),
+                (9, &ws.slot_gaussians),
+            ]
+        };
+        k.tile_lists.dispatch_indirect(gpu, pass, &lists(&self.count_mode), visible);
+        let job = ScanJob {
+            values: &ws.pair_counts,
+            prefix: &ws.pair_offsets,
+            length: ScanLength::Counter(VISIBLE_COUNTER, prepared.view.gaussian_count),
+            counter_out: PAIR_COUNTER,
+            capacity: prepared.view.pair_capacity,
+        };
+        k.scan.encode(gpu, pass, ws, &job)?;
+        k.tile_lists.dispatch_indirect(gpu, pass, &lists(&self.emit_mode), visible);
+        let tile_bits = u32::BITS - prepared.view.tiles().leading_zeros();
+        let sorted = k.sort.encode(gpu, pass, ws, (&ws.tile_keys, &ws.slots), (PAIR_COUNTER, tile_bits))?;
+        debug_assert_eq!(sorted, prepared.sorted);
+        let ranges = [(0, &ws.counters), (1, &ws.tile_keys[sorted]), (2, &ws.ranges)];
+        k.tile_ranges.dispatch_indirect(gpu, pass, &ranges, (&ws.counters, Counter::per_element_offset(PAIR_COUNTER)));
+        Ok(())
+    }
+
+    /// Reads the counters of the last view; when its pairs did not fit, grows the buffers and returns `None`: repeat the step.
+    pub fn finish(&mut self) -> Result<Option<ViewCounts>, GpuError> {
+        let counters: Vec<Counter> = self.workspace.counters.read(&self.gpu, 0, COUNTERS as usize)?;
+        let pairs = counters[PAIR_COUNTER as usize];
+        if pairs.needed as usize > self.workspace.pair_capacity {
+            self.workspace.reserve_pairs(&self.gpu, pairs.needed as usize + pairs.needed as usize / 4)?;
+            return Ok(None);
+        }
+        Ok(Some(ViewCounts { visible: counters[VISIBLE_COUNTER as usize].count, pairs: pairs.count }))
+    }
+
+    /// Renders a view and reads it back.
+    pub fn render(&mut self, cloud: &GpuCloud, camera: &ViewCamera, background: [f32; 3]) -> Result<Rendered, GpuError> {
+        loop {
+            let prepared = self.prepare(cloud, camera, background)?;
+            let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
+            self.encode_clear(&mut encoder);
+            self.encode_forward(&mut encoder.begin_compute_pass(&Default::default()), cloud, &prepared)?;
+            self.gpu.queue.submit([encoder.finish()]);
+            if self.finish()?.is_none() {
+                continue;
+            }
+            let pixels = prepared.view.pixels() as usize;
+            let state: Vec<[f32; 2]> = self.workspace.state.read(&self.gpu, 0, pixels)?;
+            return Ok(Rendered {
+                width: prepared.view.width,
+                height: prepared.view.height,
+                color_depth: self.workspace.color_depth.read(&self.gpu, 0, pixels)?,
+                transmittance: state.iter().map(|s| s[0]).collect(),
+            });
+        }
+    }
+}

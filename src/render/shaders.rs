@@ -1,0 +1,57 @@
+//! Every shader, composed of the constants, the shared parts it names, and its own file.
+
+use super::layout;
+
+/// A composed shader, named as its stage.
+pub struct ShaderSource {
+    pub name: &'static str,
+    parts: &'static [&'static str],
+    pub entry_points: &'static [&'static str],
+}
+
+impl ShaderSource {
+    /// The whole WGSL text.
+    pub fn text(&self) -> String {
+        let constants = layout::wgsl_constants();
+        std::iter::once(constants.as_str()).chain(self.parts.iter().copied()).collect::<Vec<_>>().join("\n")
+    }
+}
+
+const VIEW: &str = include_str!("../../shaders/shared/view.wgsl");
+const COUNTERS: &str = include_str!("../../shaders/shared/counters.wgsl");
+const PROJECTION: &str = include_str!("../../shaders/shared/projection.wgsl");
+const HARMONICS: &str = include_str!("../../shaders/shared/spherical_harmonics.wgsl");
+const TILE_PIXELS: &str = include_str!("../../shaders/shared/tile_pixels.wgsl");
+const PIXEL_WINDOW: &str = include_str!("../../shaders/shared/pixel_window.wgsl");
+const SINK_GRADIENT: &str = include_str!("../../shaders/shared/sink_gradient.wgsl");
+const SINK_ADAM: &str = include_str!("../../shaders/shared/sink_adam.wgsl");
+
+macro_rules! shaders {
+    ($($constant:ident = $name:literal, $file:literal, [$($part:ident),*], [$($entry:literal),*];)*) => {
+        $(pub(crate) const $constant: ShaderSource = ShaderSource {
+            name: $name,
+            parts: &[$($part,)* include_str!(concat!("../../shaders/", $file, ".wgsl"))],
+            entry_points: &[$($entry),*],
+        };)*
+        /// All shaders of the project.
+        pub const SHADERS: &[ShaderSource] = &[$($constant),*];
+    };
+}
+
+shaders! {
+    PROJECT_FORWARD = "project_forward", "project_forward", [VIEW, PROJECTION, HARMONICS], ["main"];
+    SCAN = "scan", "scan", [VIEW, COUNTERS], ["reduce", "sums", "apply"];
+    COMPACT_VISIBLE = "compact_visible", "compact_visible", [VIEW], ["main"];
+    SORT = "sort", "sort", [VIEW, COUNTERS], ["count_digits", "scan_digits", "scatter"];
+    TILE_LISTS = "tile_lists", "tile_lists", [VIEW, COUNTERS], ["main"];
+    TILE_RANGES = "tile_ranges", "tile_ranges", [VIEW, COUNTERS], ["main"];
+    RASTERIZE_FORWARD = "rasterize_forward", "rasterize_forward", [VIEW, TILE_PIXELS], ["main"];
+    LOSS_FORWARD = "loss_forward", "loss_forward", [PIXEL_WINDOW], ["main"];
+    LOSS_BACKWARD = "loss_backward", "loss_backward", [PIXEL_WINDOW], ["main"];
+    LOSS_REDUCE = "loss_reduce", "loss_reduce", [], ["main"];
+    RASTERIZE_BACKWARD = "rasterize_backward", "rasterize_backward", [VIEW, TILE_PIXELS], ["main"];
+    PROJECT_BACKWARD = "project_backward", "project_backward", [VIEW, COUNTERS, PROJECTION, HARMONICS, SINK_GRADIENT], ["main"];
+    PROJECT_BACKWARD_ADAM = "project_backward_adam", "project_backward", [VIEW, COUNTERS, PROJECTION, HARMONICS, SINK_ADAM], ["main"];
+    POSE_REDUCE = "pose_reduce", "pose_reduce", [COUNTERS], ["main"];
+    GATHER = "gather", "gather", [VIEW], ["main"];
+}

@@ -1,0 +1,119 @@
+//! The rasterizer's scratch buffers, grown when a view needs more.
+
+use super::layout::{COUNTERS, Counter, SCAN_BLOCK, SORT_BLOCK, View};
+use crate::gpu::{Gpu, GpuBuffer, GpuError};
+
+/// Bytes of one pair's gradient: three vec4.
+const PAIR_GRADIENT_BYTES: u64 = 48;
+
+/// Scratch that one rendered view leaves behind for its backward pass. Sizes only grow.
+#[derive(Debug)]
+pub struct Workspace {
+    pub counters: GpuBuffer,
+    // Per Gaussian.
+    pub(crate) capacity: usize,
+    pub projected: GpuBuffer,
+    pub(super) visible: GpuBuffer,
+    pub(super) prefix: GpuBuffer,
+    pub(super) block_sums: GpuBuffer,
+    pub(super) depth_keys: [GpuBuffer; 2],
+    /// Visible Gaussians, nearest first, in `[0]` after the depth sort.
+    pub order: [GpuBuffer; 2],
+    pub(super) pair_counts: GpuBuffer,
+    pub pair_offsets: GpuBuffer,
+    // Per pair.
+    pub(crate) pair_capacity: usize,
+    pub(super) tile_keys: [GpuBuffer; 2],
+    pub slots: [GpuBuffer; 2],
+    pub slot_gaussians: GpuBuffer,
+    pub pair_gradients: GpuBuffer,
+    pub(super) histogram: GpuBuffer,
+    // Per image.
+    pixels: u32,
+    tiles: u32,
+    pub ranges: GpuBuffer,
+    pub color_depth: GpuBuffer,
+    pub state: GpuBuffer,
+}
+
+impl Workspace {
+    pub(super) fn new(gpu: &Gpu) -> Result<Self, GpuError> {
+        let (capacity, pair_capacity) = (16_384, 131_072);
+        let empty = |label: &str| GpuBuffer::storage(gpu, label, 16);
+        let mut workspace = Self {
+            counters: GpuBuffer::storage(gpu, "counters", u64::from(COUNTERS) * std::mem::size_of::<Counter>() as u64)?,
+            capacity: 0,
+            projected: empty("projected")?,
+            visible: empty("visible")?,
+            prefix: empty("prefix")?,
+            block_sums: empty("block sums")?,
+            depth_keys: [empty("depth keys")?, empty("depth keys")?],
+            order: [empty("order")?, empty("order")?],
+            pair_counts: empty("pair counts")?,
+            pair_offsets: empty("pair offsets")?,
+            pair_capacity: 0,
+            tile_keys: [empty("tile keys")?, empty("tile keys")?],
+            slots: [empty("slots")?, empty("slots")?],
+            slot_gaussians: empty("slot Gaussians")?,
+            pair_gradients: empty("pair gradients")?,
+            histogram: empty("histogram")?,
+            pixels: 0,
+            tiles: 0,
+            ranges: empty("ranges")?,
+            color_depth: empty("rendered")?,
+            state: empty("rendered state")?,
+        };
+        workspace.reserve_gaussians(gpu, capacity)?;
+        workspace.reserve_pairs(gpu, pair_capacity)?;
+        Ok(workspace)
+    }
+
+    pub(super) fn reserve_gaussians(&mut self, gpu: &Gpu, capacity: usize) -> Result<(), GpuError> {
+        if capacity <= self.capacity {
+            return Ok(());
+        }
+        let words = |label: &str| GpuBuffer::storage(gpu, label, capacity as u64 * 4);
+        self.projected = GpuBuffer::storage(gpu, "projected", capacity as u64 * 48)?;
+        self.visible = words("visible")?;
+        self.prefix = words("prefix")?;
+        self.block_sums = GpuBuffer::storage(gpu, "block sums", (capacity as u64).div_ceil(u64::from(SCAN_BLOCK)) * 4)?;
+        self.depth_keys = [words("depth keys")?, words("depth keys")?];
+        self.order = [words("order")?, words("order")?];
+        self.pair_counts = words("pair counts")?;
+        self.pair_offsets = words("pair offsets")?;
+        self.capacity = capacity;
+        self.reserve_histogram(gpu)
+    }
+
+    pub(super) fn reserve_pairs(&mut self, gpu: &Gpu, capacity: usize) -> Result<(), GpuError> {
+        if capacity <= self.pair_capacity {
+            return Ok(());
+        }
+        let words = |label: &str| GpuBuffer::storage(gpu, label, capacity as u64 * 4);
+        self.tile_keys = [words("tile keys")?, words("tile keys")?];
+        self.slots = [words("slots")?, words("slots")?];
+        self.slot_gaussians = words("slot Gaussians")?;
+        self.pair_gradients = GpuBuffer::storage(gpu, "pair gradients", capacity as u64 * PAIR_GRADIENT_BYTES)?;
+        self.pair_capacity = capacity;
+        self.reserve_histogram(gpu)
+    }
+
+    fn reserve_histogram(&mut self, gpu: &Gpu) -> Result<(), GpuError> {
+        let blocks = (self.capacity.max(self.pair_capacity) as u64).div_ceil(u64::from(SORT_BLOCK));
+        self.histogram = GpuBuffer::storage(gpu, "histogram", blocks * 256 * 4)?;
+        Ok(())
+    }
+
+    pub(super) fn reserve_image(&mut self, gpu: &Gpu, view: &View) -> Result<(), GpuError> {
+        if view.tiles() > self.tiles {
+            self.ranges = GpuBuffer::storage(gpu, "ranges", u64::from(view.tiles()) * 8)?;
+            self.tiles = view.tiles();
+        }
+        if view.pixels() > self.pixels {
+            self.color_depth = GpuBuffer::storage(gpu, "rendered", u64::from(view.pixels()) * 16)?;
+            self.state = GpuBuffer::storage(gpu, "rendered state", u64::from(view.pixels()) * 8)?;
+            self.pixels = view.pixels();
+        }
+        Ok(())
+    }
+}

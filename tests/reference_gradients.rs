@@ -1,0 +1,150 @@
+//! The oracle against central differences in f64: every parameter, the pose, the image loss. The smooth variant of the rasterizer is
+//! used, since its cut-offs are discontinuities.
+
+mod common;
+
+use fastrand::Rng;
+use keysplat::geometry::se3;
+use keysplat::reference::loss::{LossWeights, Target64, loss};
+use keysplat::reference::project_backward::backward;
+use keysplat::reference::rasterize_forward::render;
+use keysplat::reference::{Cutoffs, Gaussian64, Image64, View64, cloud64};
+use keysplat::splat::ShDegree;
+use nalgebra::{Vector3, Vector6};
+
+const STEP: f64 = 1e-6;
+const TOLERANCE: f64 = 1e-6;
+/// Rounding of a loss of order 100, divided by the step.
+const NOISE: f64 = 1e-7;
+
+fn norm(v: &[f64]) -> f64 {
+    v.iter().map(|x| x * x).sum::<f64>().sqrt()
+}
+
+fn difference(a: &[f64], b: &[f64]) -> f64 {
+    norm(&a.iter().zip(b).map(|(a, b)| a - b).collect::<Vec<_>>())
+}
+
+fn view(rng: &mut Rng) -> View64 {
+    View64 { camera: common::camera(rng, 12, 9), background: Vector3::new(0.2, 0.5, 0.1), cutoffs: Cutoffs::Smooth }
+}
+
+#[test]
+fn parameter_gradients_are_central_differences() {
+    for (seed, degree) in ShDegree::ALL.into_iter().enumerate() {
+        let mut rng = Rng::with_seed(seed as u64);
+        let view = view(&mut rng);
+        let cloud = cloud64(&common::scene(&mut rng, 6, degree));
+        let by_image = common::image_gradient(&mut rng, 12 * 9);
+        let gradient = backward(&view, &cloud, &by_image);
+        let loss = |cloud: &[Gaussian64]| common::linear_loss(&render(&view, cloud), &by_image);
+        let mut compared = 0.0;
+        for i in 0..cloud.len() {
+            let numeric: Vec<f64> = (0..cloud[i].flat().len())
+                .map(|k| {
+                    let shifted = |by: f64| {
+                        let mut moved = cloud.clone();
+                        let mut row = moved[i].flat();
+                        row[k] += by;
+                        moved[i] = Gaussian64::from_flat(&row);
+                        loss(&moved)
+                    };
+                    (shifted(STEP) - shifted(-STEP)) / (2.0 * STEP)
+                })
+                .collect();
+            let own = gradient.cloud[i].flat();
+            assert!(
+                difference(&own, &numeric) < TOLERANCE * norm(&own) + NOISE,
+                "degree {degree:?}, Gaussian {i}: {own:?} {numeric:?}"
+            );
+            compared += norm(&own);
+        }
+        assert!(compared > 1.0, "the scene was hardly seen");
+    }
+}
+
+#[test]
+fn pose_gradient_is_a_central_difference() {
+    for seed in 0..8 {
+        let mut rng = Rng::with_seed(100 + seed);
+        let view = view(&mut rng);
+        let cloud = cloud64(&common::scene(&mut rng, 8, ShDegree::ALL[(seed % 4) as usize]));
+        let by_image = common::image_gradient(&mut rng, 12 * 9);
+        let gradient = backward(&view, &cloud, &by_image);
+        let numeric: Vec<f64> = (0..6)
+            .map(|k| {
+                let shifted = |by: f64| {
+                    let mut moved = view;
+                    let mut tau = Vector6::zeros();
+                    tau[k] = by;
+                    moved.camera.camera_from_world = se3::exp(&tau) * view.camera.camera_from_world;
+                    common::linear_loss(&render(&moved, &cloud), &by_image)
+                };
+                (shifted(STEP) - shifted(-STEP)) / (2.0 * STEP)
+            })
+            .collect();
+        let error = common::relative_error(gradient.pose.as_slice(), &numeric);
+        assert!(error < TOLERANCE, "seed {seed}: {error:e}");
+    }
+}
+
+/// With Gaussians beyond the 15% margin the Jacobian is clamped, and its gradient with it.
+#[test]
+fn clamped_jacobians_have_the_right_gradient() {
+    let mut rng = Rng::with_seed(7);
+    let view = view(&mut rng);
+    let mut cloud = cloud64(&common::scene(&mut rng, 4, ShDegree::default()));
+    for (i, g) in cloud.iter_mut().enumerate() {
+        g.mean.x = if i % 2 == 0 { 1.2 } else { -1.3 } * g.mean.z;
+        g.log_scale = Vector3::new(-0.8, -1.0, -0.9);
+    }
+    let by_image = common::image_gradient(&mut rng, 12 * 9);
+    let gradient = backward(&view, &cloud, &by_image);
+    for i in 0..cloud.len() {
+        for k in 0..3 {
+            let shifted = |by: f64| {
+                let mut moved = cloud.clone();
+                moved[i].mean[k] += by;
+                common::linear_loss(&render(&view, &moved), &by_image)
+            };
+            let numeric = (shifted(STEP) - shifted(-STEP)) / (2.0 * STEP);
+            let own = gradient.cloud[i].mean;
+            assert!((own[k] - numeric).abs() < TOLERANCE * own.norm() + NOISE, "Gaussian {i}, axis {k}: {own} {numeric}");
+        }
+    }
+}
+
+#[test]
+fn loss_gradient_is_a_central_difference() {
+    let mut rng = Rng::with_seed(3);
+    let (width, height) = (17, 14);
+    let mut number = || rng.f64();
+    let target = Target64 {
+        width,
+        height,
+        color: (0..width * height).map(|_| Vector3::new(number(), number(), number())).collect(),
+        depth: (0..width * height).map(|i| if i % 5 == 0 { 0.0 } else { 1.0 + number() }).collect(),
+    };
+    let image = Image64 {
+        color: (0..width * height).map(|_| Vector3::new(number(), number(), number())).collect(),
+        depth: (0..width * height).map(|_| 2.0 * number()).collect(),
+        transmittance: (0..width * height).map(|_| 0.4 * number()).collect(),
+    };
+    let weights = LossWeights { ssim: 0.2, depth: 0.3 };
+    let (_, gradient) = loss(&image, &target, &weights);
+    let value = |change: &dyn Fn(&mut Image64)| {
+        let mut moved = image.clone();
+        change(&mut moved);
+        loss(&moved, &target, &weights).0
+    };
+    for i in (0..width * height).step_by(7) {
+        for c in 0..3 {
+            let numeric = (value(&|m| m.color[i][c] += STEP) - value(&|m| m.color[i][c] -= STEP)) / (2.0 * STEP);
+            assert!((gradient.color[i][c] - numeric).abs() < 1e-8, "pixel {i}, channel {c}");
+        }
+        let numeric = (value(&|m| m.depth[i] += STEP) - value(&|m| m.depth[i] -= STEP)) / (2.0 * STEP);
+        assert!((gradient.depth[i] - numeric).abs() < 1e-8, "depth {i}");
+        let numeric = (value(&|m| m.transmittance[i] -= STEP) - value(&|m| m.transmittance[i] += STEP)) / (2.0 * STEP);
+        assert!((gradient.alpha[i] - numeric).abs() < 1e-8, "alpha {i}");
+    }
+}
