@@ -94,3 +94,163 @@ fn random_scenes_agree() {
         compare_gradients(&gpu, &cloud, &camera, &mut rng);
     }
 }
+
+/// A target image for the loss, 8-bit like a real one.
+fn target(rng: &mut Rng, pinhole: Pinhole) -> (RectifiedImage, Target64) {
+    let (width, height) = (pinhole.width, pinhole.height);
+    let color = image::RgbImage::from_fn(width, height, |_, _| image::Rgb([rng.u8(..), rng.u8(..), rng.u8(..)]));
+    let metres: Vec<f32> = (0..width * height).map(|i| if i % 4 == 0 { 0.0 } else { common::between(rng, 0.5, 3.0) }).collect();
+    let wide = Target64 {
+        width: width as usize,
+        height: height as usize,
+        color: color.pixels().map(|p| Vector3::from(p.0).map(|v| f64::from(v) / 255.0)).collect(),
+        depth: metres.iter().map(|m| f64::from(*m)).collect(),
+    };
+    (RectifiedImage { pinhole, color, depth: Some(DepthImage { width, height, metres }) }, wide)
+}
+
+#[test]
+fn the_loss_and_its_whole_gradient_agree() {
+    let Some(gpu) = gpu() else { return };
+    let config = LossConfig { ssim_weight: 0.2, depth_weight: 0.3 };
+    for seed in 0..4 {
+        let mut rng = Rng::with_seed(40 + seed);
+        // Neither a multiple of the tile nor of the loss's block.
+        let camera = common::camera(&mut rng, 53, 37);
+        let cloud = common::scene(&mut rng, 200, ShDegree::ALL[(seed % 4) as usize]);
+        let (image, wide) = target(&mut rng, camera.pinhole);
+        let mut rasterizer = Rasterizer::new(gpu.clone()).unwrap();
+        let mut optimiser = Optimiser::new(&gpu).unwrap();
+        let on_gpu = upload(&gpu, &cloud);
+        let image = TargetImage::new(&gpu, &image).unwrap();
+        let got = optimiser.gradients(&mut rasterizer, &on_gpu, &camera, &image, &config).unwrap();
+        let view = View64 { background: Vector3::zeros(), ..view64(&camera) };
+        let rendered = rasterize_forward::render(&view, &cloud64(&cloud));
+        let weights = LossWeights { ssim: f64::from(config.ssim_weight), depth: f64::from(config.depth_weight) };
+        let (value, by_image) = loss(&rendered, &wide, &weights);
+        let difference = (f64::from(got.loss.total(&config)) - value).abs();
+        assert!(difference < 1e-4 * value, "loss {} against {value}", got.loss.total(&config));
+        let expected = backward(&view, &cloud64(&cloud), &by_image);
+        let error = common::relative_error(&flat(&cloud64(&got.cloud)), &flat(&expected.cloud));
+        assert!(error < GRADIENT_TOLERANCE, "gradient: {error:e}");
+        let pose: Vec<f64> = got.pose.iter().map(|v| f64::from(*v)).collect();
+        let error = common::relative_error(&pose, expected.pose.as_slice());
+        assert!(error < GRADIENT_TOLERANCE, "pose gradient: {error:e}");
+    }
+}
+
+/// Three steps of the fused kernel against the oracle's Adam fed with the GPU's own gradients.
+#[test]
+fn adam_steps_agree() {
+    let Some(gpu) = gpu() else { return };
+    let (loss, adam) = (LossConfig::default(), AdamConfig::default());
+    let mut rng = Rng::with_seed(11);
+    let camera = common::camera(&mut rng, 48, 32);
+    let mut cloud = common::scene(&mut rng, 60, ShDegree::ALL[1]);
+    // One that cannot be seen: it must not move.
+    cloud.means[5].z = -1.0;
+    let image = TargetImage::new(&gpu, &target(&mut rng, camera.pinhole).0).unwrap();
+    let mut rasterizer = Rasterizer::new(gpu.clone()).unwrap();
+    let mut optimiser = Optimiser::new(&gpu).unwrap();
+    let on_gpu = upload(&gpu, &cloud);
+    let mut expected: Vec<Vec<f64>> = cloud64(&cloud).iter().map(Gaussian64::flat).collect();
+    let mut states = vec![Adam64::default(); cloud.len()];
+    for _ in 0..3 {
+        let gradients = optimiser.gradients(&mut rasterizer, &on_gpu, &camera, &image, &loss).unwrap();
+        for (i, gradient) in cloud64(&gradients.cloud).iter().enumerate() {
+            let mut rates = vec![f64::from(adam.position_rate); 3];
+            rates.extend([f64::from(adam.scale_rate); 3]);
+            rates.extend([f64::from(adam.rotation_rate); 4]);
+            rates.push(f64::from(adam.opacity_rate));
+            rates.extend([f64::from(adam.color_rate); 3]);
+            rates.extend([f64::from(adam.harmonics_rate); 9]);
+            let decay = (f64::from(adam.beta_1), f64::from(adam.beta_2), f64::from(adam.epsilon));
+            states[i].step(&mut expected[i], &gradient.flat(), &rates, decay);
+        }
+        optimiser.step(&mut rasterizer, &on_gpu, &camera, &image, (&loss, &adam)).unwrap();
+    }
+    let moved = on_gpu.download(&gpu).unwrap();
+    let start = flat(&cloud64(&cloud));
+    let travel = |to: &[f64]| to.iter().zip(&start).map(|(a, b)| a - b).collect::<Vec<f64>>();
+    let error = common::relative_error(&travel(&flat(&cloud64(&moved))), &travel(&expected.concat()));
+    assert!(error < 1e-3, "Adam: {error:e}");
+    assert_eq!(moved.get(5), cloud.get(5), "an unseen Gaussian moved");
+}
+
+/// The hazards of splatting, one Gaussian each, among ordinary ones: nothing may become NaN, and what is drawn must be right.
+#[test]
+fn hazards_stay_finite_and_right() {
+    let Some(gpu) = gpu() else { return };
+    type Spoil = fn(&mut GaussianCloud, usize);
+    let hazards: &[(&str, Spoil)] = &[
+        ("on the near plane", |c, i| c.means[i] = glam::Vec3::new(0.0, 0.0, 0.05)),
+        ("just in front of the camera", |c, i| c.means[i] = glam::Vec3::new(0.02, 0.01, 0.3)),
+        ("behind the camera", |c, i| c.means[i].z = -2.0),
+        ("far beside the frustum", |c, i| c.means[i].x = 40.0),
+        ("no rotation", |c, i| c.rotations[i] = glam::Quat::from_xyzw(0.0, 0.0, 0.0, 0.0)),
+        ("tiny rotation", |c, i| c.rotations[i] *= 1e-3),
+        ("huge", |c, i| c.log_scales[i] = glam::Vec3::splat(3.0)),
+        ("overflowing scale", |c, i| c.log_scales[i] = glam::Vec3::splat(100.0)),
+        ("vanishing scale", |c, i| c.log_scales[i] = glam::Vec3::splat(-40.0)),
+        ("a needle", |c, i| c.log_scales[i] = glam::Vec3::new(0.0, -12.0, -12.0)),
+        ("a disc", |c, i| c.log_scales[i] = glam::Vec3::new(-1.0, -1.0, -14.0)),
+        ("opaque", |c, i| c.raw_opacities[i] = 30.0),
+        ("transparent", |c, i| c.raw_opacities[i] = -30.0),
+        ("at the cut-off", |c, i| c.raw_opacities[i] = -5.5373344),
+        ("same depth as another", |c, i| c.means[i] = c.means[0]),
+        ("out of gamut", |c, i| c.sh[i] = glam::Vec3::new(-9.0, 40.0, 0.0)),
+    ];
+    for (seed, (name, spoil)) in hazards.iter().enumerate() {
+        let mut rng = Rng::with_seed(seed as u64);
+        let camera = common::camera(&mut rng, 40, 30);
+        let mut cloud = common::scene(&mut rng, 40, ShDegree::default());
+        spoil(&mut cloud, 7);
+        eprintln!("hazard: {name}");
+        let expected = compare_images(&gpu, &cloud, &camera);
+        assert!(expected.transmittance.iter().any(|t| *t < 0.9), "the scene was not seen");
+        compare_gradients(&gpu, &cloud, &camera, &mut rng);
+    }
+}
+
+#[test]
+fn non_finite_gaussians_are_refused_or_culled() {
+    let Some(gpu) = gpu() else { return };
+    let mut rng = Rng::with_seed(1);
+    let camera = common::camera(&mut rng, 40, 30);
+    let clean = common::scene(&mut rng, 30, ShDegree::default());
+    let mut dirty = clean.clone();
+    for value in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+        let mut bad = clean.get(0);
+        bad.mean.x = value;
+        dirty.push(bad);
+        let mut bad = clean.get(0);
+        bad.raw_opacity = value;
+        dirty.push(bad);
+    }
+    let mut on_gpu = GpuCloud::new(&gpu, dirty.sh_degree, 4).unwrap();
+    assert_eq!(on_gpu.append(&gpu, &dirty).unwrap(), 6, "bad Gaussians are counted");
+    let mut rasterizer = Rasterizer::new(gpu.clone()).unwrap();
+    let rendered = rasterizer.render(&on_gpu, &camera, BACKGROUND).unwrap();
+    // Even written straight into the buffer they are culled, not spread.
+    on_gpu.parameters().write(&gpu, 3, &[[f32::NAN; 4]]);
+    let with_nan = rasterizer.render(&on_gpu, &camera, BACKGROUND).unwrap();
+    assert_eq!(rendered.transmittance.len(), with_nan.transmittance.len());
+    assert!(with_nan.color_depth.iter().flatten().all(|v| v.is_finite()));
+}
+
+#[test]
+fn pairs_that_outgrow_their_buffers_are_never_dropped() {
+    let Some(gpu) = gpu() else { return };
+    let mut rng = Rng::with_seed(5);
+    let camera = common::camera(&mut rng, 640, 480);
+    let mut cloud = common::scene(&mut rng, 400, ShDegree::default());
+    cloud.log_scales.iter_mut().for_each(|s| *s = glam::Vec3::splat(-0.5));
+    cloud.raw_opacities.iter_mut().for_each(|o| *o = -3.0);
+    let mut rasterizer = Rasterizer::new(gpu.clone()).unwrap();
+    let on_gpu = upload(&gpu, &cloud);
+    // 400 Gaussians over most of 1200 tiles: more than the first buffers hold.
+    let first = rasterizer.render(&on_gpu, &camera, BACKGROUND).unwrap();
+    let counts = rasterizer.finish().unwrap().unwrap();
+    assert!(counts.pairs > 131_072, "the scene does not overflow: {counts:?}");
+    assert_eq!(first, rasterizer.render(&on_gpu, &camera, BACKGROUND).unwrap(), "rendering is repeatable to the bit");
+}
