@@ -3,6 +3,7 @@
 
 pub mod geometry;
 pub mod gpu;
+pub mod mapping;
 pub mod optimise;
 pub mod reference;
 pub mod render;

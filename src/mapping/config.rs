@@ -1,0 +1,148 @@
+//! What the mapper can be told.
+
+use serde::{Deserialize, Serialize};
+
+use crate::optimise::{AdamConfig, LossConfig};
+use crate::splat::ShDegree;
+
+/// The mapper's configuration.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct MappingConfig {
+    /// Degree of the spherical harmonics: 0 has no view dependence.
+    pub sh_degree: ShDegree,
+    /// Optimisation steps after each keyframe, one view each.
+    pub iterations_per_keyframe: usize,
+    /// Steps after the first keyframe, which has no map to start from.
+    pub first_iterations: usize,
+    /// Seed of the draws among keyframes.
+    pub seed: u64,
+    pub window: WindowConfig,
+    pub seeding: SeedingConfig,
+    pub prune: PruneConfig,
+    pub loss: LossConfig,
+    pub adam: AdamConfig,
+}
+
+impl Default for MappingConfig {
+    fn default() -> Self {
+        Self {
+            sh_degree: ShDegree::default(),
+            iterations_per_keyframe: 50,
+            first_iterations: 100,
+            seed: 0,
+            window: WindowConfig::default(),
+            seeding: SeedingConfig::default(),
+            prune: PruneConfig::default(),
+            loss: LossConfig::default(),
+            adam: AdamConfig::default(),
+        }
+    }
+}
+
+/// Which keyframes a step may draw.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct WindowConfig {
+    /// The newest keyframes, always in the window.
+    pub recent: usize,
+    /// Older keyframes that share most landmarks with the newest one.
+    pub covisible: usize,
+    /// Share of steps that go to any older keyframe, so that the map does not forget.
+    pub older_share: f32,
+}
+
+impl Default for WindowConfig {
+    fn default() -> Self {
+        Self { recent: 6, covisible: 3, older_share: 0.35 }
+    }
+}
+
+/// Where a keyframe adds Gaussians.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SeedingConfig {
+    /// One seed per `stride`² pixels where the image has detail, and per `flat_stride`² where it is flat.
+    pub stride: u32,
+    pub flat_stride: u32,
+    /// Mean colour gradient (0 to 1, per pixel) of a block above which it has detail.
+    pub detail_gradient: f32,
+    /// A pixel whose alpha is below this lacks map.
+    pub min_alpha: f32,
+    /// A pixel whose measured depth is nearer than the map's by this share of itself shows something that the map lacks.
+    pub depth_disagreement: f32,
+    /// Standard deviation of a seed in units of its spacing on the surface.
+    pub footprint: f32,
+    /// Opacity of a seed.
+    pub opacity: f32,
+    /// No seed nearer to the camera or farther than this, metres.
+    pub min_depth_metres: f32,
+    pub max_depth_metres: f32,
+}
+
+impl Default for SeedingConfig {
+    fn default() -> Self {
+        Self {
+            stride: 2,
+            flat_stride: 4,
+            detail_gradient: 0.02,
+            min_alpha: 0.6,
+            depth_disagreement: 0.06,
+            footprint: 0.55,
+            opacity: 0.7,
+            min_depth_metres: 0.15,
+            max_depth_metres: 20.0,
+        }
+    }
+}
+
+/// Which Gaussians are dropped after a keyframe's steps.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct PruneConfig {
+    /// Opacity below which a Gaussian is dropped.
+    pub min_opacity: f32,
+    /// Largest standard deviation, metres.
+    pub max_scale_metres: f32,
+}
+
+impl Default for PruneConfig {
+    fn default() -> Self {
+        Self { min_opacity: 0.03, max_scale_metres: 1.0 }
+    }
+}
+
+impl MappingConfig {
+    /// Says what is wrong with the values, if anything.
+    pub fn validate(&self) -> Result<(), String> {
+        let s = &self.seeding;
+        if s.stride == 0 || s.flat_stride < s.stride || s.flat_stride % s.stride != 0 {
+            return Err("mapping.seeding.flat_stride must be a multiple of mapping.seeding.stride, both at least 1".into());
+        }
+        let shares = [
+            ("window.older_share", self.window.older_share),
+            ("seeding.min_alpha", s.min_alpha),
+            ("seeding.opacity", s.opacity),
+            ("prune.min_opacity", self.prune.min_opacity),
+        ];
+        if let Some((name, value)) = shares.iter().find(|(_, value)| !(0.0..1.0).contains(value)) {
+            return Err(format!("mapping.{name} must lie between 0 and 1, not {value}"));
+        }
+        let positive = [
+            ("seeding.depth_disagreement", s.depth_disagreement),
+            ("seeding.footprint", s.footprint),
+            ("seeding.opacity", s.opacity),
+            ("seeding.min_depth_metres", s.min_depth_metres),
+            ("seeding.max_depth_metres", s.max_depth_metres),
+            ("prune.max_scale_metres", self.prune.max_scale_metres),
+        ];
+        if let Some((name, value)) = positive.iter().find(|(_, value)| !(value.is_finite() && *value > 0.0)) {
+            return Err(format!("mapping.{name} must be positive, not {value}"));
+        }
+        if self.window.recent == 0 {
+            return Err("mapping.window.recent must be at least 1".into());
+        }
+        self.loss.validate().map_err(|e| format!("mapping.loss: {e}"))?;
+        self.adam.validate().map_err(|e| format!("mapping.adam: {e}"))
+    }
+}

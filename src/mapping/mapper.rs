@@ -1,0 +1,165 @@
+//! The mapper: owns the Gaussians, their moments and the keyframe window.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use fastrand::Rng;
+
+use super::keyframe::MappedKeyframe;
+use super::{Keyframe, KeyframeId, MappingConfig, prune, seeding};
+use crate::geometry::Se3;
+use crate::gpu::{Gpu, GpuError};
+use crate::optimise::{Optimiser, StepReport};
+use crate::render::{GpuCloud, Rasterizer, Rendered, ViewCamera};
+use crate::splat::GaussianCloud;
+
+const FIRST_CAPACITY: usize = 32_768;
+
+#[derive(Debug, thiserror::Error)]
+pub enum MappingError {
+    #[error(transparent)]
+    Gpu(#[from] GpuError),
+    #[error("keyframe {id} has no depth, and the map can only be seeded from depth")]
+    NoDepth { id: KeyframeId },
+    #[error("the loss of keyframe {id} is not finite; please report this with the recording's name and the configuration")]
+    NotFinite { id: KeyframeId },
+}
+
+/// What happened to a keyframe.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct KeyframeReport {
+    pub id: KeyframeId,
+    pub seeded: usize,
+    pub pruned: usize,
+    pub gaussians: usize,
+    pub iterations: usize,
+    /// Mean PSNR of the steps' views before each step.
+    pub psnr_db: f32,
+}
+
+/// Seeds, optimises and prunes the map.
+#[derive(Debug)]
+pub struct Mapper {
+    config: MappingConfig,
+    gpu: Arc<Gpu>,
+    rasterizer: Rasterizer,
+    optimiser: Optimiser,
+    cloud: GpuCloud,
+    keyframes: Vec<MappedKeyframe>,
+    rng: Rng,
+    step_times: Vec<Duration>,
+}
+
+impl Mapper {
+    pub fn new(gpu: Arc<Gpu>, config: &MappingConfig) -> Result<Self, MappingError> {
+        Ok(Self {
+            config: config.clone(),
+            rasterizer: Rasterizer::new(gpu.clone())?,
+            optimiser: Optimiser::new(&gpu)?,
+            cloud: GpuCloud::new(&gpu, config.sh_degree, FIRST_CAPACITY)?,
+            keyframes: Vec::new(),
+            rng: Rng::with_seed(config.seed),
+            step_times: Vec::new(),
+            gpu,
+        })
+    }
+
+    /// Takes in a keyframe: seeds what the map lacks, optimises over the window, prunes. `stop` is asked between the steps.
+    pub fn insert(&mut self, keyframe: &Keyframe, stop: &dyn Fn() -> bool) -> Result<KeyframeReport, MappingError> {
+        if keyframe.image.depth.is_none() && self.keyframes.is_empty() {
+            return Err(MappingError::NoDepth { id: keyframe.id });
+        }
+        let mapped = MappedKeyframe::new(&self.gpu, keyframe)?;
+        let seeded = self.seed(keyframe, &mapped.camera)?;
+        self.keyframes.push(mapped);
+        let first = self.keyframes.len() == 1;
+        let iterations = if first { self.config.first_iterations } else { self.config.iterations_per_keyframe };
+        let (done, psnr_db) = self.optimise(iterations, stop)?;
+        let before = self.cloud.len();
+        let keep = prune::plan(&self.gpu, &self.cloud, &self.config.prune)?;
+        self.cloud.keep(&self.gpu, &keep)?;
+        let gaussians = self.cloud.len();
+        Ok(KeyframeReport { id: keyframe.id, seeded, pruned: before - gaussians, gaussians, iterations: done, psnr_db })
+    }
+
+    /// Moves earlier keyframes to better poses. Unknown ids are those that were never sent to the mapper.
+    pub fn update_poses(&mut self, updates: &[(KeyframeId, Se3)]) {
+        let updates: BTreeMap<KeyframeId, &Se3> = updates.iter().map(|(id, pose)| (*id, pose)).collect();
+        for keyframe in &mut self.keyframes {
+            if let Some(world_from_camera) = updates.get(&keyframe.id) {
+                keyframe.camera.camera_from_world = world_from_camera.inverse();
+            }
+        }
+    }
+
+    /// The map as it is now.
+    pub fn download(&self) -> Result<GaussianCloud, MappingError> {
+        Ok(self.cloud.download(&self.gpu)?)
+    }
+
+    /// Renders the map over black.
+    pub fn render(&mut self, camera: &ViewCamera) -> Result<Rendered, MappingError> {
+        Ok(self.rasterizer.render(&self.cloud, camera, [0.0; 3])?)
+    }
+
+    /// Duration of each step so far.
+    pub fn step_times(&self) -> &[Duration] {
+        &self.step_times
+    }
+
+    pub fn gaussians(&self) -> usize {
+        self.cloud.len()
+    }
+
+    fn seed(&mut self, keyframe: &Keyframe, camera: &ViewCamera) -> Result<usize, MappingError> {
+        let rendered = if self.cloud.is_empty() { None } else { Some(self.render(camera)?) };
+        let seeds = seeding::seed(keyframe, rendered.as_ref(), &self.config.seeding, self.config.sh_degree);
+        self.cloud.append(&self.gpu, &seeds)?;
+        Ok(seeds.len())
+    }
+
+    fn optimise(&mut self, iterations: usize, stop: &dyn Fn() -> bool) -> Result<(usize, f32), MappingError> {
+        let window = self.window();
+        let mut psnr_sum = 0.0;
+        let mut done = 0;
+        while done < iterations && !stop() && !self.cloud.is_empty() {
+            let index = self.draw(&window, done);
+            let started = Instant::now();
+            let report = self.step(index)?;
+            self.step_times.push(started.elapsed());
+            if !report.loss.total(&self.config.loss).is_finite() {
+                return Err(MappingError::NotFinite { id: self.keyframes[index].id });
+            }
+            psnr_sum += report.loss.psnr_db();
+            done += 1;
+        }
+        Ok((done, psnr_sum / done.max(1) as f32))
+    }
+
+    fn step(&mut self, index: usize) -> Result<StepReport, GpuError> {
+        let keyframe = &self.keyframes[index];
+        let configs = (&self.config.loss, &self.config.adam);
+        self.optimiser.step(&mut self.rasterizer, &self.cloud, &keyframe.camera, &keyframe.target, configs)
+    }
+
+    /// Indices of the newest keyframes and of the older ones that share most landmarks with the newest.
+    fn window(&self) -> Vec<usize> {
+        let len = self.keyframes.len();
+        let recent = len.saturating_sub(self.config.window.recent);
+        let mut window: Vec<usize> = (recent..len).rev().collect();
+        let covisible = &self.keyframes[len - 1].covisible;
+        let older = covisible.iter().filter_map(|id| self.keyframes[..recent].binary_search_by_key(id, |k| k.id).ok());
+        window.extend(older.take(self.config.window.covisible));
+        window
+    }
+
+    /// The keyframe of the next step: the window in turn, newest first, and now and then any older one.
+    fn draw(&mut self, window: &[usize], step: usize) -> usize {
+        let older = self.keyframes.len().saturating_sub(self.config.window.recent);
+        if older > 0 && self.rng.f32() < self.config.window.older_share {
+            return self.rng.usize(..older);
+        }
+        window[step % window.len()]
+    }
+}

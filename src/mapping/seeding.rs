@@ -1,0 +1,184 @@
+//! New Gaussians from a keyframe: where the render lacks alpha or lies behind the measured surface, one per block of pixels, small
+//! blocks where the image has detail and larger ones where it is flat, each the size of its block on the surface.
+//!
+//! Pixels without depth are seeded too where the map has nothing: their depth is interpolated across the hole, from the farther side
+//! where the sides differ (a structured-light sensor is blind in the shadow beside a near object). Later views correct them.
+
+use glam::{Quat, Vec3};
+use nalgebra::{Point3, Vector2};
+
+use super::{Keyframe, SeedingConfig};
+use crate::render::Rendered;
+use crate::sequence::{DepthImage, RectifiedImage};
+use crate::splat::{Gaussian, GaussianCloud, ShDegree, raw_opacity_from_opacity, sh::dc_from_color};
+
+/// Sides of a hole whose depths differ by more than this factor belong to different surfaces.
+const SAME_SURFACE_RATIO: f32 = 1.2;
+
+/// Seeds for what `keyframe` shows and `rendered`, the map seen from it, does not. Without a render the whole image is seeded.
+pub(super) fn seed(
+    keyframe: &Keyframe,
+    rendered: Option<&Rendered>,
+    config: &SeedingConfig,
+    sh_degree: ShDegree,
+) -> GaussianCloud {
+    let mut cloud = GaussianCloud::new(sh_degree);
+    let image = &keyframe.image;
+    let Some(depth) = &image.depth else { return cloud };
+    let filled = fill_holes(depth);
+    let (width, height) = image.color.dimensions();
+    let coarse = config.flat_stride;
+    for y0 in (0..height).step_by(coarse as usize) {
+        for x0 in (0..width).step_by(coarse as usize) {
+            let detailed = mean_gradient(image, x0, y0, coarse) > config.detail_gradient;
+            let stride = if detailed { config.stride } else { coarse };
+            for y in (y0..(y0 + coarse).min(height)).step_by(stride as usize) {
+                for x in (x0..(x0 + coarse).min(width)).step_by(stride as usize) {
+                    let center = ((x + stride / 2).min(width - 1), (y + stride / 2).min(height - 1));
+                    let metres = filled[(center.1 * width + center.0) as usize];
+                    let measured = depth.at(center.0, center.1);
+                    if metres >= config.min_depth_metres
+                        && metres <= config.max_depth_metres
+                        && rendered.is_none_or(|r| lacks(r, (center.1 * width + center.0) as usize, measured, config))
+                    {
+                        cloud.push(gaussian(keyframe, center, metres, stride, config));
+                    }
+                }
+            }
+        }
+    }
+    cloud
+}
+
+/// Whether the map lacks what the pixel shows.
+fn lacks(rendered: &Rendered, pixel: usize, measured: Option<f32>, config: &SeedingConfig) -> bool {
+    if 1.0 - rendered.transmittance[pixel] < config.min_alpha {
+        return true;
+    }
+    match (rendered.depth(pixel), measured) {
+        (Some(map), Some(measured)) => map - measured > config.depth_disagreement * measured,
+        _ => false,
+    }
+}
+
+fn gaussian(keyframe: &Keyframe, (x, y): (u32, u32), metres: f32, stride: u32, config: &SeedingConfig) -> Gaussian {
+    let pinhole = &keyframe.image.pinhole;
+    let p_in_camera = pinhole.unproject(&Vector2::new(f64::from(x), f64::from(y)), f64::from(metres));
+    let p_in_world = keyframe.world_from_camera * Point3::from(p_in_camera);
+    let spacing_metres = stride as f32 * metres / pinhole.fx as f32;
+    let color = keyframe.image.color.get_pixel(x, y).0.map(|c| f32::from(c) / 255.0);
+    Gaussian {
+        mean: Vec3::new(p_in_world.x as f32, p_in_world.y as f32, p_in_world.z as f32),
+        log_scale: Vec3::splat((config.footprint * spacing_metres).ln()),
+        rotation: Quat::IDENTITY,
+        raw_opacity: raw_opacity_from_opacity(config.opacity),
+        sh: vec![dc_from_color(Vec3::from(color))],
+    }
+}
+
+/// Mean absolute colour difference to the right and lower neighbours over a block, 0 to 1.
+fn mean_gradient(image: &RectifiedImage, x0: u32, y0: u32, size: u32) -> f32 {
+    let (width, height) = image.color.dimensions();
+    let at = |x: u32, y: u32| image.color.get_pixel(x.min(width - 1), y.min(height - 1)).0.map(i32::from);
+    let difference = |a: [i32; 3], b: [i32; 3]| (0..3).map(|c| (a[c] - b[c]).abs()).sum::<i32>();
+    let mut sum = 0;
+    for (x, y) in (y0..y0 + size).flat_map(|y| (x0..x0 + size).map(move |x| (x, y))) {
+        sum += difference(at(x, y), at(x + 1, y)) + difference(at(x, y), at(x, y + 1));
+    }
+    sum as f32 / (255.0 * 6.0 * (size * size) as f32)
+}
+
+/// Depth with its holes interpolated from their four sides, metres; 0 only where a pixel has no measured side at all.
+fn fill_holes(depth: &DepthImage) -> Vec<f32> {
+    let (width, height) = (depth.width as usize, depth.height as usize);
+    // Nearest measured pixel to the left, right, top and bottom: (depth, distance).
+    let mut sides = vec![[(0.0f32, 0.0f32); 4]; width * height];
+    let mut sweep = |side: usize, order: &mut dyn Iterator<Item = usize>| {
+        let mut last = (0.0f32, 0.0f32);
+        for i in order {
+            last.1 += 1.0;
+            if depth.metres[i] > 0.0 {
+                last = (depth.metres[i], 0.0);
+            }
+            sides[i][side] = last;
+        }
+    };
+    for y in 0..height {
+        sweep(0, &mut (0..width).map(|x| y * width + x));
+        sweep(1, &mut (0..width).rev().map(|x| y * width + x));
+    }
+    for x in 0..width {
+        sweep(2, &mut (0..height).map(|y| y * width + x));
+        sweep(3, &mut (0..height).rev().map(|y| y * width + x));
+    }
+    depth.metres.iter().zip(&sides).map(|(&own, around)| if own > 0.0 { own } else { interpolate(around) }).collect()
+}
+
+fn interpolate(around: &[(f32, f32); 4]) -> f32 {
+    let known = || around.iter().filter(|(metres, _)| *metres > 0.0);
+    let farthest = known().map(|s| s.0).fold(0.0, f32::max);
+    let (mut sum, mut weights) = (0.0, 0.0);
+    for (metres, distance) in known().filter(|s| s.0 * SAME_SURFACE_RATIO >= farthest) {
+        sum += metres / distance;
+        weights += 1.0 / distance;
+    }
+    if weights > 0.0 { sum / weights } else { 0.0 }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::{Pinhole, Se3};
+    use image::{Rgb, RgbImage};
+
+    fn keyframe(color: RgbImage, metres: Vec<f32>) -> Keyframe {
+        let (width, height) = color.dimensions();
+        let pinhole = Pinhole { fx: 30.0, fy: 30.0, cx: 15.5, cy: 11.5, width, height };
+        let image = RectifiedImage { pinhole, color, depth: Some(DepthImage { width, height, metres }) };
+        Keyframe { id: 0, world_from_camera: Se3::identity(), image, covisible: vec![] }
+    }
+
+    #[test]
+    fn detail_gets_more_seeds_than_a_flat_wall() {
+        let config = SeedingConfig::default();
+        let checker = RgbImage::from_fn(32, 24, |x, y| if x < 16 { Rgb([90; 3]) } else { Rgb([((x + y) % 2 * 255) as u8; 3]) });
+        let cloud = seed(&keyframe(checker, vec![1.0; 32 * 24]), None, &config, ShDegree::default());
+        let column = |m: &Vec3| m.x * 30.0 + 15.5;
+        // The last flat block borders on detail and counts as such.
+        assert_eq!(cloud.means.iter().filter(|m| column(m) < 11.5).count(), 3 * 6);
+        assert_eq!(cloud.means.iter().filter(|m| column(m) > 16.5).count(), 8 * 12);
+    }
+
+    #[test]
+    fn only_what_the_map_lacks_is_seeded() {
+        let config = SeedingConfig { flat_stride: 2, ..SeedingConfig::default() };
+        let frame = keyframe(RgbImage::from_pixel(32, 24, Rgb([90; 3])), vec![1.0; 32 * 24]);
+        let render = |x: usize| match x / 8 {
+            0 => ([0.0, 0.0, 0.0, 1.0], 0.0), // as measured
+            1 => ([0.0, 0.0, 0.0, 0.0], 1.0), // nothing there
+            2 => ([0.0, 0.0, 0.0, 1.5], 0.0), // the map is behind
+            _ => ([0.0, 0.0, 0.0, 0.7], 0.0), // the map is in front
+        };
+        let pixels: Vec<_> = (0..32 * 24).map(|i| render(i % 32)).collect();
+        let rendered = Rendered {
+            width: 32,
+            height: 24,
+            color_depth: pixels.iter().map(|p| p.0).collect(),
+            transmittance: pixels.iter().map(|p| p.1).collect(),
+        };
+        let cloud = seed(&frame, Some(&rendered), &config, ShDegree::default());
+        assert_eq!(cloud.len(), 2 * 4 * 12);
+        assert!(cloud.means.iter().all(|m| (7.0..=24.5).contains(&(m.x * 30.0 + 15.5))));
+    }
+
+    #[test]
+    fn holes_take_the_farther_side_and_interpolate_a_slope() {
+        let mut metres = vec![0.0; 9];
+        (metres[0], metres[8]) = (1.0, 3.0);
+        let filled = fill_holes(&DepthImage { width: 9, height: 1, metres });
+        assert!(filled[1..8].iter().all(|m| *m == 3.0));
+        let filled = fill_holes(&DepthImage { width: 5, height: 1, metres: vec![1.0, 0.0, 0.0, 0.0, 1.1] });
+        assert!((filled[2] - 1.05).abs() < 1e-6 && filled[1] < filled[2] && filled[2] < filled[3]);
+        assert!(fill_holes(&DepthImage { width: 2, height: 1, metres: vec![0.0; 2] }).iter().all(|m| *m == 0.0));
+    }
+}
