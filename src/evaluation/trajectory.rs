@@ -41,10 +41,7 @@ impl Similarity {
 
     /// A camera's pose moved into the truth's world.
     pub fn transform_pose(&self, world_from_camera: &Se3) -> Se3 {
-        Se3::from_parts(
-            self.transform(&world_from_camera.translation.vector).into(),
-            self.rotation * world_from_camera.rotation,
-        )
+        Se3::from_parts(self.transform(&world_from_camera.translation.vector).into(), self.rotation * world_from_camera.rotation)
     }
 }
 
@@ -84,7 +81,8 @@ pub struct TrajectoryErrors {
 /// A *step* goes from one associated pair to the next: what `evo_rpe --delta 1 --delta_unit f` measures. Where truth exists for
 /// every n-th frame only, or frames were lost, a step spans n frames, and its error is divided by n before squaring: a mean
 /// rate of drift. Drift adds up over a step and comes out the same for every n; noise of single poses does not, and comes out
-/// up to n times smaller than with truth at each frame. Compare only runs against the same truth.
+/// up to n times smaller than with truth at each frame. Compare only runs against the same truth. A frame's duration is the
+/// median over the estimate. Two poses that share one true pose make no step here, though one of no true motion in evo.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RelativeErrors {
     pub steps: usize,
@@ -98,7 +96,7 @@ pub struct RelativeErrors {
 
 /// Pairs poses of the same moment: for each pose of the shorter trajectory the nearest in time of the longer one, if within
 /// `max_difference_s`; of two equally near ones the earlier; on equal lengths the estimate counts as the shorter. One to one
-/// wherever the longer trajectory is also the denser one. As evo's `associate_trajectories`.
+/// wherever the longer trajectory is also the denser one; elsewhere a pose of the longer one may serve twice, as in evo.
 pub fn associate(truth: &Trajectory, estimate: &Trajectory, max_difference_s: f64) -> Vec<Pair> {
     let truth_is_shorter = truth.poses.len() < estimate.poses.len();
     let (shorter, longer) = if truth_is_shorter { (truth, estimate) } else { (estimate, truth) };
@@ -183,11 +181,8 @@ pub fn align(from: &[Vector3<f64>], to: &[Vector3<f64>], alignment: Alignment) -
 /// The rotation `R` that maximises `Σ bᵀ R a` for `moments = Σ a bᵀ`: the eigenvector of Horn's symmetric matrix that belongs to
 /// its largest eigenvalue, read as a quaternion.
 fn best_rotation(moments: &Matrix3<f64>) -> UnitQuaternion<f64> {
-    let skewed = Vector3::new(
-        moments[(1, 2)] - moments[(2, 1)],
-        moments[(2, 0)] - moments[(0, 2)],
-        moments[(0, 1)] - moments[(1, 0)],
-    );
+    let skewed =
+        Vector3::new(moments[(1, 2)] - moments[(2, 1)], moments[(2, 0)] - moments[(0, 2)], moments[(0, 1)] - moments[(1, 0)]);
     let mut horn = Matrix4::zeros();
     horn[(0, 0)] = moments.trace();
     horn.fixed_view_mut::<1, 3>(0, 1).copy_from(&skewed.transpose());
@@ -249,9 +244,7 @@ mod tests {
 
     fn path(stamps_s: impl IntoIterator<Item = f64>) -> Trajectory {
         let pose = |t: f64| se3::exp(&Vector6::new(t.sin(), 0.3 * t, (0.7 * t).cos(), 0.2 * t, 0.1 * t.sin(), -0.1 * t));
-        Trajectory {
-            poses: stamps_s.into_iter().map(|t| StampedPose { timestamp_s: t, world_from_camera: pose(t) }).collect(),
-        }
+        Trajectory { poses: stamps_s.into_iter().map(|t| StampedPose { timestamp_s: t, world_from_camera: pose(t) }).collect() }
     }
 
     fn moved(trajectory: &Trajectory, tau: &Vector6<f64>, scale: f64) -> Trajectory {

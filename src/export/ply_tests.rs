@@ -40,7 +40,12 @@ fn each_value_lies_where_the_reference_code_puts_it() {
         // 2 (w + x + y + z): a half each once it is normalised, but for the sign of y.
         rotation: Quat::from_xyzw(2.0, -2.0, 2.0, 2.0),
         raw_opacity: 0.75,
-        sh: vec![Vec3::new(10.0, 20.0, 30.0), Vec3::new(11.0, 21.0, 31.0), Vec3::new(12.0, 22.0, 32.0), Vec3::new(13.0, 23.0, 33.0)],
+        sh: vec![
+            Vec3::new(10.0, 20.0, 30.0),
+            Vec3::new(11.0, 21.0, 31.0),
+            Vec3::new(12.0, 22.0, 32.0),
+            Vec3::new(13.0, 23.0, 33.0),
+        ],
     });
     let bytes = encode(&cloud).unwrap();
     let (header, body) = split(&bytes);
