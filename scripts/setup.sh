@@ -100,8 +100,9 @@ official_rustup() {
     has curl || apt_install curl ca-certificates
     say "Rust $rust_version or newer is needed; running the official installer from https://sh.rustup.rs"
     installer=$(mktemp)
-    curl --proto '=https' --tlsv1.2 -sSf https://sh.rustup.rs -o "$installer"
     status=0
+    curl --proto '=https' --tlsv1.2 -sSf https://sh.rustup.rs -o "$installer" || status=$?
+    [ "$status" -eq 0 ] || fail "cannot fetch https://sh.rustup.rs; install Rust $rust_version or newer by hand, then run this again"
     sh "$installer" -y --profile minimal --default-toolchain stable -c rustfmt -c clippy || status=$?
     rm -f "$installer"
     [ "$status" -eq 0 ] || fail "the installer of rustup failed; see https://rustup.rs"
