@@ -1,0 +1,227 @@
+//! Image errors: PSNR, SSIM, depth L1.
+//!
+//! SSIM: Wang et al., *Image quality assessment: from error visibility to structural similarity*, 2004, with their 11×11 Gaussian
+//! window (σ 1.5); the figure is that of scikit-image's `structural_similarity(gaussian_weights=True, sigma=1.5,
+//! use_sample_covariance=False, data_range=1, channel_axis=2)`, which leaves out the border that the window does not fit in.
+//! `tests/scikit_image.rs` holds them together.
+//!
+//! Left out: LPIPS, which needs a network's weights.
+
+use ::image::RgbImage;
+
+/// The window reaches this many pixels to each side: `int(3.5 σ + 0.5)` for σ = 1.5.
+const RADIUS: usize = 5;
+const WINDOW: usize = 2 * RADIUS + 1;
+const SIGMA_PIXELS: f64 = 1.5;
+/// (K₁ L)² and (K₂ L)² of the paper, for a data range L of 1.
+const C1: f64 = 0.01 * 0.01;
+const C2: f64 = 0.03 * 0.03;
+
+/// A colour image, row-major `[height * width]`, RGB in [0, 1].
+#[derive(Clone, Debug, PartialEq)]
+pub struct ImageF32 {
+    pub width: usize,
+    pub height: usize,
+    pub pixels: Vec<[f32; 3]>,
+}
+
+#[derive(Debug, PartialEq, thiserror::Error)]
+pub enum ImageError {
+    #[error("images of {a:?} and {b:?} pixels cannot be compared; resize one")]
+    Size { a: (usize, usize), b: (usize, usize) },
+    #[error("an image of {width}x{height} is smaller than SSIM's window of {WINDOW}x{WINDOW}")]
+    TooSmall { width: usize, height: usize },
+}
+
+impl ImageF32 {
+    /// `None` unless there are `width * height` pixels.
+    pub fn new(width: usize, height: usize, pixels: Vec<[f32; 3]>) -> Option<Self> {
+        (width.checked_mul(height) == Some(pixels.len())).then_some(Self { width, height, pixels })
+    }
+
+    /// 0..255 to [0, 1].
+    pub fn from_rgb8(image: &RgbImage) -> Self {
+        let (width, height) = image.dimensions();
+        let pixels = image.pixels().map(|pixel| pixel.0.map(|value| f32::from(value) / 255.0)).collect();
+        Self { width: width as usize, height: height as usize, pixels }
+    }
+
+    /// Clamps every value to [0, 1], what a screen would show: for rendered images, before any comparison. NaN becomes 0.
+    pub fn clamped(mut self) -> Self {
+        for value in self.pixels.as_flattened_mut() {
+            *value = if value.is_nan() { 0.0 } else { value.clamp(0.0, 1.0) };
+        }
+        self
+    }
+
+    fn check_same_size(&self, other: &Self) -> Result<(), ImageError> {
+        let (a, b) = ((self.width, self.height), (other.width, other.height));
+        if a == b { Ok(()) } else { Err(ImageError::Size { a, b }) }
+    }
+}
+
+/// Peak signal-to-noise ratio over all pixels and channels, dB, for a peak of 1; infinite for equal images.
+pub fn psnr(rendered: &ImageF32, recorded: &ImageF32) -> Result<f64, ImageError> {
+    psnr_where(rendered, recorded, |_| true)
+}
+
+/// PSNR over the values where the recorded image is above zero, channel by channel: MonoGS's protocol, which hides the black
+/// borders of undistorted images. Infinite where there is none.
+pub fn psnr_where_lit(rendered: &ImageF32, recorded: &ImageF32) -> Result<f64, ImageError> {
+    psnr_where(rendered, recorded, |value| value > 0.0)
+}
+
+fn psnr_where(rendered: &ImageF32, recorded: &ImageF32, counts: impl Fn(f32) -> bool) -> Result<f64, ImageError> {
+    rendered.check_same_size(recorded)?;
+    let (mut sum, mut count) = (0.0, 0usize);
+    for (&a, &b) in rendered.pixels.as_flattened().iter().zip(recorded.pixels.as_flattened()) {
+        if counts(b) {
+            sum += (f64::from(a) - f64::from(b)).powi(2);
+            count += 1;
+        }
+    }
+    Ok(-10.0 * (sum / count.max(1) as f64).log10())
+}
+
+/// Structural similarity, the mean over RGB and over the pixels whose whole window is inside the image.
+pub fn ssim(a: &ImageF32, b: &ImageF32) -> Result<f64, ImageError> {
+    a.check_same_size(b)?;
+    let (width, height) = (a.width, a.height);
+    if width < WINDOW || height < WINDOW {
+        return Err(ImageError::TooSmall { width, height });
+    }
+    let sum: f64 = (0..3).map(|channel| ssim_sum(a, b, channel)).sum();
+    Ok(sum / (3 * (width - 2 * RADIUS) * (height - 2 * RADIUS)) as f64)
+}
+
+/// The sum of one channel's SSIM over all inner pixels. A ring of filtered rows keeps the working set in the cache.
+fn ssim_sum(a: &ImageF32, b: &ImageF32, channel: usize) -> f64 {
+    let weights = window();
+    let (width, inner) = (a.width, a.width - 2 * RADIUS);
+    // Per row: a, b, a² + b², a b; filtered along the row.
+    let mut ring: Vec<[Vec<f64>; 4]> = (0..WINDOW).map(|_| std::array::from_fn(|_| vec![0.0; inner])).collect();
+    let mut raw: [Vec<f64>; 4] = std::array::from_fn(|_| vec![0.0; width]);
+    let mut filtered: [Vec<f64>; 4] = std::array::from_fn(|_| vec![0.0; inner]);
+    let mut sum = 0.0;
+    for y in 0..a.height {
+        let row = y * width..(y + 1) * width;
+        for (x, (pa, pb)) in a.pixels[row.clone()].iter().zip(&b.pixels[row]).enumerate() {
+            let (va, vb) = (f64::from(pa[channel]), f64::from(pb[channel]));
+            raw[0][x] = va;
+            raw[1][x] = vb;
+            raw[2][x] = va * va + vb * vb;
+            raw[3][x] = va * vb;
+        }
+        for (raw, out) in raw.iter().zip(&mut ring[y % WINDOW]) {
+            filter(&weights, std::array::from_fn(|k| &raw[k..k + inner]), out);
+        }
+        if y + 1 < WINDOW {
+            continue;
+        }
+        for (quantity, out) in filtered.iter_mut().enumerate() {
+            // The oldest row lies right after the newest in the ring.
+            filter(&weights, std::array::from_fn(|k| ring[(y + 1 + k) % WINDOW][quantity].as_slice()), out);
+        }
+        sum += ssim_row(&filtered);
+    }
+    sum
+}
+
+/// `out[i] = Σ_k weights[k] * taps[k][i]`, for symmetric weights.
+fn filter(weights: &[f64; RADIUS + 1], taps: [&[f64]; WINDOW], out: &mut [f64]) {
+    let n = out.len();
+    let taps = taps.map(|tap| &tap[..n]);
+    for i in 0..n {
+        let mut sum = weights[0] * taps[RADIUS][i];
+        for k in 1..=RADIUS {
+            sum += weights[k] * (taps[RADIUS - k][i] + taps[RADIUS + k][i]);
+        }
+        out[i] = sum;
+    }
+}
+
+fn ssim_row([mean_a, mean_b, squares, product]: &[Vec<f64>; 4]) -> f64 {
+    let mut sum = 0.0;
+    for i in 0..mean_a.len() {
+        let (ua, ub) = (mean_a[i], mean_b[i]);
+        let means = ua * ua + ub * ub;
+        let variances = squares[i] - means;
+        let covariance = product[i] - ua * ub;
+        sum += (2.0 * ua * ub + C1) * (2.0 * covariance + C2) / ((means + C1) * (variances + C2));
+    }
+    sum
+}
+
+/// The Gaussian's right half with its centre, such that the whole sums to 1.
+fn window() -> [f64; RADIUS + 1] {
+    let half: [f64; RADIUS + 1] = std::array::from_fn(|k| (-0.5 * (k as f64 / SIGMA_PIXELS).powi(2)).exp());
+    let sum = half[0] + 2.0 * half[1..].iter().sum::<f64>();
+    half.map(|weight| weight / sum)
+}
+
+/// Mean absolute depth error in metres over the pixels where the sensor measured something (> 0); `None` where it measured
+/// nothing. A rendered depth of 0 (nothing there) counts with its full error. Both `[height * width]`, metres.
+pub fn depth_l1(rendered_metres: &[f32], sensor_metres: &[f32]) -> Option<f64> {
+    assert_eq!(rendered_metres.len(), sensor_metres.len(), "depth images of one size");
+    let (mut sum, mut count) = (0.0, 0usize);
+    for (&rendered, &sensor) in rendered_metres.iter().zip(sensor_metres) {
+        if sensor > 0.0 {
+            sum += (f64::from(rendered) - f64::from(sensor)).abs();
+            count += 1;
+        }
+    }
+    (count > 0).then(|| sum / count as f64)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn gray(width: usize, height: usize, value: f32) -> ImageF32 {
+        ImageF32::new(width, height, vec![[value; 3]; width * height]).unwrap()
+    }
+
+    #[test]
+    fn psnr_of_a_known_difference() {
+        // A difference of 0.1 everywhere is 20 dB.
+        assert!((psnr(&gray(4, 3, 0.6), &gray(4, 3, 0.5)).unwrap() - 20.0).abs() < 1e-5);
+        assert_eq!(psnr(&gray(4, 3, 0.5), &gray(4, 3, 0.5)).unwrap(), f64::INFINITY);
+    }
+
+    #[test]
+    fn the_mask_leaves_black_values_out() {
+        let mut recorded = gray(2, 1, 0.5);
+        recorded.pixels[0] = [0.0, 0.0, 0.5];
+        let rendered = gray(2, 1, 0.6);
+        // Four values differ by 0.1, two are black.
+        assert!((psnr_where_lit(&rendered, &recorded).unwrap() - 20.0).abs() < 1e-5);
+        assert!(psnr(&rendered, &recorded).unwrap() < 10.0);
+    }
+
+    #[test]
+    fn sizes_are_checked() {
+        let error = psnr(&gray(4, 3, 0.0), &gray(3, 4, 0.0)).unwrap_err();
+        assert_eq!(error, ImageError::Size { a: (4, 3), b: (3, 4) });
+        assert_eq!(ssim(&gray(20, 10, 0.0), &gray(20, 10, 0.0)), Err(ImageError::TooSmall { width: 20, height: 10 }));
+        assert_eq!(ImageF32::new(2, 2, vec![[0.0; 3]; 3]), None);
+    }
+
+    #[test]
+    fn ssim_of_flat_images_is_the_luminance_term() {
+        let expected = (2.0 * 0.2 * 0.8 + C1) / (0.2 * 0.2 + 0.8 * 0.8 + C1);
+        assert!((ssim(&gray(16, 12, 0.2), &gray(16, 12, 0.8)).unwrap() - expected).abs() < 1e-6);
+        assert!((ssim(&gray(11, 11, 0.3), &gray(11, 11, 0.3)).unwrap() - 1.0).abs() < 1e-12);
+    }
+
+    #[test]
+    fn depth_counts_where_the_sensor_measured() {
+        assert_eq!(depth_l1(&[1.5, 9.0, 0.0], &[1.0, 0.0, 2.0]), Some(1.25));
+        assert_eq!(depth_l1(&[1.0], &[0.0]), None);
+    }
+
+    #[test]
+    fn clamping_removes_what_no_screen_shows() {
+        let image = ImageF32::new(1, 1, vec![[-0.5, 1.5, f32::NAN]]).unwrap();
+        assert_eq!(image.clamped().pixels, [[0.0, 1.0, 0.0]]);
+    }
+}

@@ -1,0 +1,344 @@
+//! The report of a run: `metrics.json`, and the same figures as a table for people.
+//!
+//! A figure that does not apply is `null` in the file (and `–` in the table), never left out, so that every file has every field.
+//! JSON knows no infinity: a PSNR of equal images is `null` too.
+
+use std::fmt;
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+
+use crate::export::{ExportError, write_atomically};
+
+/// Everything that is known about a run. Field names carry their units.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Metrics {
+    pub sequence: String,
+    pub sensor: SensorKind,
+    /// Frames arrived by their timestamps (`true`) or as fast as they were consumed.
+    pub paced: bool,
+    pub frames: u64,
+    pub frames_read_failed: u64,
+    pub frames_tracked: u64,
+    pub keyframes: u64,
+    pub ate_rmse_m: AteFigures,
+    pub rpe: RpeFigures,
+    pub images: ImageProtocols,
+    pub gaussians: Option<u64>,
+    pub map_bytes: Option<u64>,
+    /// SHA-256 of the exported map's bytes.
+    pub map_hash: Option<String>,
+    pub wall_s: f64,
+    pub tracking_ms: Option<Times>,
+    pub mapping: Option<MappingFigures>,
+    pub peak_host_bytes: Option<u64>,
+    pub peak_gpu_bytes: Option<u64>,
+    pub adapter: Option<Adapter>,
+    pub cpu: Option<String>,
+    pub threads: u64,
+    pub version: String,
+    /// SHA-256 of the resolved configuration's text.
+    pub config_hash: String,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum SensorKind {
+    Rgbd,
+    Mono,
+    Stereo,
+}
+
+/// Absolute trajectory error, each aligned over its own poses.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct AteFigures {
+    pub all_frames: Option<f64>,
+    pub keyframes: Option<f64>,
+}
+
+/// See [`super::trajectory::RelativeErrors`] for how a frame is counted where truth is rarer.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RpeFigures {
+    pub trans_m_per_frame: Option<f64>,
+    pub rot_deg_per_frame: Option<f64>,
+}
+
+/// The three protocols by which rendered images are compared with recorded ones.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ImageProtocols {
+    /// Every 8th frame, which the mapper never saw.
+    pub held_out: Option<ImageFigures>,
+    /// Every posed frame (Photo-SLAM).
+    pub all_frames: Option<ImageFigures>,
+    /// Every 5th frame that is no keyframe, PSNR where the image is lit (MonoGS).
+    pub monogs: Option<ImageFigures>,
+}
+
+/// Means over images. A figure that no image has is `null`.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ImageFigures {
+    pub count: u64,
+    pub psnr_db: Option<f64>,
+    pub ssim: Option<f64>,
+    /// Over the images that have sensor depth.
+    pub depth_l1_m: Option<f64>,
+}
+
+/// Adds images up to [`ImageFigures`], in the order they come.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct ImageMeans {
+    count: u64,
+    psnr_db: f64,
+    ssim: f64,
+    depth_count: u64,
+    depth_l1_m: f64,
+}
+
+/// Times in milliseconds.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Times {
+    pub median: f64,
+    pub p95: f64,
+    pub max: f64,
+}
+
+/// Times in milliseconds, where the largest one says little.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct UsualTimes {
+    pub median: f64,
+    pub p95: f64,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct MappingFigures {
+    pub iterations: u64,
+    pub iterations_per_frame: f64,
+    pub ms_per_iteration: Option<UsualTimes>,
+    /// The size at which the mapper compares images, pixels.
+    pub map_width: u32,
+    pub map_height: u32,
+}
+
+/// The GPU, or what stands in for it.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Adapter {
+    pub name: String,
+    pub backend: String,
+    /// `discretegpu`, `integratedgpu`, `virtualgpu`, `cpu` or `other`.
+    pub kind: String,
+    pub driver: String,
+}
+
+impl ImageMeans {
+    /// Counts one image in; `depth_l1_m` is `None` where the sensor has no depth.
+    pub fn add(&mut self, psnr_db: f64, ssim: f64, depth_l1_m: Option<f64>) {
+        self.count += 1;
+        self.psnr_db += psnr_db;
+        self.ssim += ssim;
+        if let Some(metres) = depth_l1_m {
+            self.depth_count += 1;
+            self.depth_l1_m += metres;
+        }
+    }
+
+    /// `None` if no image was counted.
+    pub fn figures(&self) -> Option<ImageFigures> {
+        let mean = |sum: f64, count: u64| (count > 0).then(|| sum / count as f64).filter(|mean| mean.is_finite());
+        (self.count > 0).then(|| ImageFigures {
+            count: self.count,
+            psnr_db: mean(self.psnr_db, self.count),
+            ssim: mean(self.ssim, self.count),
+            depth_l1_m: mean(self.depth_l1_m, self.depth_count),
+        })
+    }
+}
+
+impl Times {
+    /// Of times in milliseconds in any order; `None` for no times. The 95th percentile is the smallest time that at least 95 %
+    /// do not exceed; the median of an even number is the mean of the middle two.
+    pub fn of(times_ms: &[f64]) -> Option<Self> {
+        let mut sorted = times_ms.to_vec();
+        sorted.sort_by(f64::total_cmp);
+        let n = sorted.len();
+        Some(Self {
+            max: *sorted.last()?,
+            median: (sorted[(n - 1) / 2] + sorted[n / 2]) / 2.0,
+            p95: sorted[(n * 95).div_ceil(100) - 1],
+        })
+    }
+}
+
+impl UsualTimes {
+    /// As [`Times::of`].
+    pub fn of(times_ms: &[f64]) -> Option<Self> {
+        Times::of(times_ms).map(|Times { median, p95, .. }| Self { median, p95 })
+    }
+}
+
+/// SHA-256 as lower-case hexadecimal digits: of the exported map's bytes, of the configuration's text.
+pub fn sha256_hex(bytes: &[u8]) -> String {
+    Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+/// Writes `metrics.json`.
+pub fn write_json(metrics: &Metrics, path: &Path) -> Result<(), ExportError> {
+    let mut text = serde_json::to_string_pretty(metrics).expect("metrics are numbers and strings, which JSON can hold");
+    text.push('\n');
+    write_atomically(path, text.as_bytes())
+}
+
+/// A figure with its decimals and unit, or a dash.
+fn cell(value: Option<f64>, decimals: usize, unit: &str) -> String {
+    value.map_or_else(|| "–".into(), |value| format!("{value:.decimals$} {unit}").trim_end().to_owned())
+}
+
+fn mebibytes(bytes: Option<u64>) -> String {
+    cell(bytes.map(|bytes| bytes as f64 / f64::from(1 << 20)), 1, "MiB")
+}
+
+impl fmt::Display for ImageFigures {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let depth = cell(self.depth_l1_m.map(|m| 100.0 * m), 2, "cm");
+        let (psnr, ssim) = (cell(self.psnr_db, 2, "dB"), cell(self.ssim, 4, ""));
+        write!(f, "PSNR {psnr}   SSIM {ssim}   depth L1 {depth}   ({} images)", self.count)
+    }
+}
+
+/// One figure a line, name left; no line is left out.
+impl fmt::Display for Metrics {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let mut row = |name: &str, value: String| writeln!(f, "{name:<22}{value}");
+        let centimetres = |metres: Option<f64>| cell(metres.map(|m| 100.0 * m), 2, "cm");
+        let sensor = format!("{:?}", self.sensor).to_lowercase();
+        let lost_percent = 100.0 * self.frames.saturating_sub(self.frames_tracked) as f64 / self.frames.max(1) as f64;
+        row("sequence", format!("{} ({sensor}, {})", self.sequence, if self.paced { "paced" } else { "unpaced" }))?;
+        row("frames", format!("{}, {} keyframes, {} unreadable", self.frames, self.keyframes, self.frames_read_failed))?;
+        row("ATE RMSE", format!("{}   lost frames {lost_percent:.1} %", centimetres(self.ate_rmse_m.all_frames)))?;
+        row("ATE RMSE, keyframes", centimetres(self.ate_rmse_m.keyframes))?;
+        let degrees = cell(self.rpe.rot_deg_per_frame, 3, "°");
+        row("RPE per frame", format!("{}   {degrees}", cell(self.rpe.trans_m_per_frame.map(|m| 1000.0 * m), 2, "mm")))?;
+        for (name, figures) in [
+            ("held-out images", self.images.held_out),
+            ("all images", self.images.all_frames),
+            ("images as MonoGS", self.images.monogs),
+        ] {
+            row(name, figures.map_or_else(|| "–".into(), |figures| figures.to_string()))?;
+        }
+        let gaussians = self.gaussians.map_or_else(|| "–".into(), |n| n.to_string());
+        row("Gaussians", format!("{gaussians}   map on disk {}", mebibytes(self.map_bytes)))?;
+        row("map hash", self.map_hash.clone().unwrap_or_else(|| "–".into()))?;
+        row("whole run", format!("{:.1} s", self.wall_s))?;
+        let tracking = self.tracking_ms.map(|t| format!("median {:.1} ms   p95 {:.1} ms   max {:.1} ms", t.median, t.p95, t.max));
+        row("tracking per frame", tracking.unwrap_or_else(|| "–".into()))?;
+        row("mapping", self.mapping.map_or_else(|| "–".into(), |mapping| mapping.to_string()))?;
+        row("peak memory", format!("host {}   GPU {}", mebibytes(self.peak_host_bytes), mebibytes(self.peak_gpu_bytes)))?;
+        row("adapter", self.adapter.as_ref().map_or_else(|| "–".into(), Adapter::to_string))?;
+        row("CPU", format!("{}   {} threads", self.cpu.as_deref().unwrap_or("–"), self.threads))?;
+        row("keysplat", format!("{}   configuration {}", self.version, self.config_hash))
+    }
+}
+
+impl fmt::Display for MappingFigures {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { iterations, iterations_per_frame, map_width, map_height, .. } = self;
+        write!(f, "{iterations} iterations at {map_width}x{map_height}, {iterations_per_frame:.2} per frame")?;
+        let Some(UsualTimes { median, p95 }) = self.ms_per_iteration else { return Ok(()) };
+        write!(f, "   median {median:.1} ms   p95 {p95:.1} ms")
+    }
+}
+
+impl fmt::Display for Adapter {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} ({}, {}, {})", self.name, self.kind, self.backend, self.driver)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The example of the protocol, field for field.
+    const EXAMPLE: &str = r#"{ "sequence": "redkitchen", "sensor": "rgbd", "paced": false, "frames": 600, "frames_read_failed": 0,
+      "frames_tracked": 600, "keyframes": 61,
+      "ate_rmse_m": {"all_frames": 0.01, "keyframes": 0.01}, "rpe": {"trans_m_per_frame": 0.002, "rot_deg_per_frame": 0.1},
+      "images": {"held_out":   {"count": 75, "psnr_db": 24.0, "ssim": 0.85, "depth_l1_m": 0.02},
+                 "all_frames": {"count": 600, "psnr_db": 24.5, "ssim": 0.86, "depth_l1_m": 0.02},
+                 "monogs":     {"count": 110, "psnr_db": 24.1, "ssim": 0.85, "depth_l1_m": 0.02}},
+      "gaussians": 60000, "map_bytes": 3000000, "map_hash": "00ff",
+      "wall_s": 90.0, "tracking_ms": {"median": 20.0, "p95": 30.0, "max": 50.0},
+      "mapping": {"iterations": 1800, "iterations_per_frame": 3.0, "ms_per_iteration": {"median": 40.0, "p95": 60.0},
+                  "map_width": 320, "map_height": 240},
+      "peak_host_bytes": 900000000, "peak_gpu_bytes": 200000000,
+      "adapter": {"name": "llvmpipe", "backend": "vulkan", "kind": "cpu", "driver": "Mesa 22.3.6"},
+      "cpu": "name", "threads": 2, "version": "0.1.0", "config_hash": "00ff" }"#;
+
+    #[test]
+    fn the_file_has_exactly_the_fields_of_the_protocol() {
+        let metrics: Metrics = serde_json::from_str(EXAMPLE).unwrap();
+        let expected: serde_json::Value = serde_json::from_str(EXAMPLE).unwrap();
+        assert_eq!(serde_json::to_value(&metrics).unwrap(), expected);
+    }
+
+    #[test]
+    fn what_does_not_apply_is_null_and_not_left_out() {
+        let mut metrics: Metrics = serde_json::from_str(EXAMPLE).unwrap();
+        metrics.images.monogs = None;
+        metrics.ate_rmse_m.keyframes = None;
+        metrics.adapter = None;
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("metrics.json");
+        write_json(&metrics, &path).unwrap();
+        let value: serde_json::Value = serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
+        for pointer in ["/images/monogs", "/ate_rmse_m/keyframes", "/adapter"] {
+            assert_eq!(value.pointer(pointer), Some(&serde_json::Value::Null), "{pointer}");
+        }
+        assert_eq!(serde_json::from_value::<Metrics>(value).unwrap(), metrics);
+    }
+
+    #[test]
+    fn the_table_shows_lost_frames_beside_the_error() {
+        let mut metrics: Metrics = serde_json::from_str(EXAMPLE).unwrap();
+        metrics.frames_tracked = 570;
+        metrics.images.held_out = None;
+        let table = metrics.to_string();
+        assert!(table.contains("ATE RMSE              1.00 cm   lost frames 5.0 %\n"), "{table}");
+        assert!(table.contains("held-out images       –\n"), "{table}");
+        assert!(table.contains("PSNR 24.50 dB   SSIM 0.8600   depth L1 2.00 cm   (600 images)\n"), "{table}");
+    }
+
+    #[test]
+    fn times_are_ranked() {
+        let times: Vec<f64> = (1..=20).rev().map(f64::from).collect();
+        assert_eq!(Times::of(&times), Some(Times { median: 10.5, p95: 19.0, max: 20.0 }));
+        assert_eq!(Times::of(&[3.0]), Some(Times { median: 3.0, p95: 3.0, max: 3.0 }));
+        assert_eq!(Times::of(&[]), None);
+    }
+
+    #[test]
+    fn means_leave_out_what_was_not_measured() {
+        let mut means = ImageMeans::default();
+        assert_eq!(means.figures(), None);
+        means.add(20.0, 0.5, Some(0.1));
+        means.add(30.0, 0.7, None);
+        let figures = means.figures().unwrap();
+        assert_eq!((figures.count, figures.psnr_db, figures.depth_l1_m), (2, Some(25.0), Some(0.1)));
+        means.add(f64::INFINITY, 1.0, None);
+        assert_eq!(means.figures().unwrap().psnr_db, None);
+    }
+
+    #[test]
+    fn the_hash_is_sha256() {
+        // FIPS 180-2, appendix B.1.
+        assert_eq!(sha256_hex(b"abc"), "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad");
+    }
+}

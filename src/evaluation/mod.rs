@@ -1,0 +1,12 @@
+//! Measures a run: trajectory errors, image errors, and the report that holds them all.
+//!
+//! Knows nothing of how poses and pictures were made; rendering them is the caller's business.
+
+pub mod image;
+pub mod machine;
+pub mod metrics;
+pub mod trajectory;
+
+pub use image::{ImageError, ImageF32, depth_l1, psnr, psnr_where_lit, ssim};
+pub use metrics::{Metrics, Times, sha256_hex, write_json};
+pub use trajectory::{Alignment, AlignmentError, Similarity, TrajectoryErrors, evaluate_trajectory};

@@ -1,0 +1,327 @@
+//! Trajectory errors: association by time, alignment, absolute (ATE) and relative (RPE) error.
+//!
+//! Definitions: Sturm et al., *A benchmark for the evaluation of RGB-D SLAM systems*, 2012; Umeyama, *Least-squares estimation of
+//! transformation parameters between two point patterns*, 1991, solved with Horn's unit quaternion (1987), which has no
+//! reflections to rule out. The figures are those of the Python package `evo` (`evo_ape tum truth estimate -a`, `-as`,
+//! `--t_max_diff 0.02`); `tests/evo.rs` holds them together.
+//!
+//! Left out: interpolation of the truth between its stamps, and errors over path lengths (KITTI's).
+
+use nalgebra::{Matrix3, Matrix4, Quaternion, UnitQuaternion, Vector3};
+
+use crate::geometry::{Se3, Trajectory};
+
+/// Two stamps further apart than this are not of the same moment (the TUM benchmark's value).
+pub const MAX_TIME_DIFFERENCE_S: f64 = 0.02;
+
+/// Fewer pairs always fit, so their error says nothing.
+const MIN_PAIRS: usize = 3;
+
+/// What the estimate may be moved by before it is compared.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Alignment {
+    /// SE(3): RGB-D and stereo, which know their scale.
+    Rigid,
+    /// Sim(3): monocular, whose scale is free.
+    Similarity,
+}
+
+/// `p_in_truth = scale * (rotation * p_in_estimate) + translation`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Similarity {
+    pub rotation: UnitQuaternion<f64>,
+    pub translation: Vector3<f64>,
+    pub scale: f64,
+}
+
+impl Similarity {
+    pub fn transform(&self, p_in_estimate: &Vector3<f64>) -> Vector3<f64> {
+        self.rotation * p_in_estimate * self.scale + self.translation
+    }
+
+    /// A camera's pose moved into the truth's world.
+    pub fn transform_pose(&self, world_from_camera: &Se3) -> Se3 {
+        Se3::from_parts(self.transform(&world_from_camera.translation.vector).into(), self.rotation * world_from_camera.rotation)
+    }
+}
+
+#[derive(Debug, PartialEq, thiserror::Error)]
+pub enum AlignmentError {
+    #[error(
+        "only {pairs} poses lie within {max_difference_s} s of the truth's; at least {MIN_PAIRS} are needed: check that both count time from the same start"
+    )]
+    TooFewPairs { pairs: usize, max_difference_s: f64 },
+    #[error("the camera stands still, so no scale can be found; align rigidly")]
+    NoScale,
+}
+
+/// Positions (in `poses`) of two poses of the same moment.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Pair {
+    pub truth: usize,
+    pub estimate: usize,
+}
+
+/// All figures of one estimate against the truth.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TrajectoryErrors {
+    /// Poses that had truth; the others count nowhere.
+    pub pairs: usize,
+    /// Absolute translation error after alignment, metres.
+    pub ate_rmse_m: f64,
+    pub ate_median_m: f64,
+    pub ate_max_m: f64,
+    pub rpe: RelativeErrors,
+    /// The estimate's world into the truth's.
+    pub alignment: Similarity,
+}
+
+/// Root mean squares of the motion error between neighbouring pairs.
+///
+/// A *step* goes from one associated pair to the next: what `evo_rpe --delta 1 --delta_unit f` measures. Where truth exists for
+/// every n-th frame only, or frames were lost, a step spans n frames, and its error is divided by n before squaring: a mean
+/// rate of drift. Drift adds up over a step and comes out the same for every n; noise of single poses does not, and comes out
+/// up to n times smaller than with truth at each frame. Compare only runs against the same truth. A frame's duration is the
+/// median over the estimate. Two poses that share one true pose make no step here, though one of no true motion in evo.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RelativeErrors {
+    pub steps: usize,
+    pub trans_m_per_step: f64,
+    pub rot_deg_per_step: f64,
+    pub trans_m_per_frame: f64,
+    pub rot_deg_per_frame: f64,
+    pub trans_m_per_s: f64,
+    pub rot_deg_per_s: f64,
+}
+
+/// Pairs poses of the same moment: for each pose of the shorter trajectory the nearest in time of the longer one, if within
+/// `max_difference_s`; of two equally near ones the earlier; on equal lengths the estimate counts as the shorter. One to one
+/// wherever the longer trajectory is also the denser one; elsewhere a pose of the longer one may serve twice, as in evo.
+pub fn associate(truth: &Trajectory, estimate: &Trajectory, max_difference_s: f64) -> Vec<Pair> {
+    let truth_is_shorter = truth.poses.len() < estimate.poses.len();
+    let (shorter, longer) = if truth_is_shorter { (truth, estimate) } else { (estimate, truth) };
+    let partners = shorter.poses.iter().map(|pose| nearest(longer, pose.timestamp_s, max_difference_s));
+    partners
+        .enumerate()
+        .filter_map(|(i, partner)| {
+            let (truth, estimate) = if truth_is_shorter { (i, partner?) } else { (partner?, i) };
+            Some(Pair { truth, estimate })
+        })
+        .collect()
+}
+
+fn nearest(trajectory: &Trajectory, timestamp_s: f64, max_difference_s: f64) -> Option<usize> {
+    let poses = &trajectory.poses;
+    let after = poses.partition_point(|pose| pose.timestamp_s <= timestamp_s);
+    let distance = |i: usize| (poses[i].timestamp_s - timestamp_s).abs();
+    let candidates = [after.checked_sub(1), (after < poses.len()).then_some(after)];
+    // `min_by` keeps the first of equals: the earlier.
+    let best = candidates.into_iter().flatten().min_by(|&a, &b| distance(a).total_cmp(&distance(b)))?;
+    (distance(best) <= max_difference_s).then_some(best)
+}
+
+/// Aligns an estimate with the truth and measures it; stamps are associated within [`MAX_TIME_DIFFERENCE_S`].
+///
+/// For the error over keyframes give a trajectory of keyframes only: the alignment is then theirs too, as in MonoGS.
+pub fn evaluate_trajectory(
+    truth: &Trajectory,
+    estimate: &Trajectory,
+    alignment: Alignment,
+) -> Result<TrajectoryErrors, AlignmentError> {
+    let pairs = associate(truth, estimate, MAX_TIME_DIFFERENCE_S);
+    let position = |trajectory: &Trajectory, i: usize| trajectory.poses[i].world_from_camera.translation.vector;
+    let from: Vec<_> = pairs.iter().map(|pair| position(estimate, pair.estimate)).collect();
+    let to: Vec<_> = pairs.iter().map(|pair| position(truth, pair.truth)).collect();
+    let alignment = align(&from, &to, alignment)?;
+
+    let mut errors_m: Vec<f64> = from.iter().zip(&to).map(|(a, b)| (alignment.transform(a) - b).norm()).collect();
+    let ate_rmse_m = root_mean_square(errors_m.iter().copied());
+    errors_m.sort_by(f64::total_cmp);
+    Ok(TrajectoryErrors {
+        pairs: pairs.len(),
+        ate_rmse_m,
+        ate_median_m: errors_m[errors_m.len() / 2],
+        ate_max_m: errors_m[errors_m.len() - 1],
+        rpe: relative_errors(truth, estimate, &pairs, &alignment),
+        alignment,
+    })
+}
+
+/// The motion that brings `from` closest to `to` in the least-squares sense, `[N, 3]` metres, point `i` to point `i`.
+///
+/// Points on one line leave the rotation about it open (evo refuses them); the smallest distance is the same for each choice.
+pub fn align(from: &[Vector3<f64>], to: &[Vector3<f64>], alignment: Alignment) -> Result<Similarity, AlignmentError> {
+    assert_eq!(from.len(), to.len(), "points are aligned in pairs");
+    if from.len() < MIN_PAIRS {
+        return Err(AlignmentError::TooFewPairs { pairs: from.len(), max_difference_s: MAX_TIME_DIFFERENCE_S });
+    }
+    let mean = |points: &[Vector3<f64>]| points.iter().sum::<Vector3<f64>>() / points.len() as f64;
+    let (mean_from, mean_to) = (mean(from), mean(to));
+    let mut moments = Matrix3::zeros();
+    let (mut spread_from, mut spread_to) = (0.0, 0.0);
+    for (a, b) in from.iter().zip(to) {
+        let (a, b) = (a - mean_from, b - mean_to);
+        moments += a * b.transpose();
+        spread_from += a.norm_squared();
+        spread_to += b.norm_squared();
+    }
+    let rotation = best_rotation(&moments);
+    let scale = match alignment {
+        Alignment::Rigid => 1.0,
+        Alignment::Similarity => {
+            if spread_from == 0.0 || spread_to == 0.0 {
+                return Err(AlignmentError::NoScale);
+            }
+            (rotation.to_rotation_matrix().matrix() * moments).trace() / spread_from
+        }
+    };
+    Ok(Similarity { rotation, translation: mean_to - rotation * mean_from * scale, scale })
+}
+
+/// The rotation `R` that maximises `Σ bᵀ R a` for `moments = Σ a bᵀ`: the eigenvector of Horn's symmetric matrix that belongs to
+/// its largest eigenvalue, read as a quaternion.
+fn best_rotation(moments: &Matrix3<f64>) -> UnitQuaternion<f64> {
+    let skewed =
+        Vector3::new(moments[(1, 2)] - moments[(2, 1)], moments[(2, 0)] - moments[(0, 2)], moments[(0, 1)] - moments[(1, 0)]);
+    let mut horn = Matrix4::zeros();
+    horn[(0, 0)] = moments.trace();
+    horn.fixed_view_mut::<1, 3>(0, 1).copy_from(&skewed.transpose());
+    horn.fixed_view_mut::<3, 1>(1, 0).copy_from(&skewed);
+    let symmetric = moments + moments.transpose() - Matrix3::identity() * moments.trace();
+    horn.fixed_view_mut::<3, 3>(1, 1).copy_from(&symmetric);
+    let eigen = horn.symmetric_eigen();
+    let q = eigen.eigenvectors.column(eigen.eigenvalues.imax());
+    UnitQuaternion::from_quaternion(Quaternion::new(q[0], q[1], q[2], q[3]))
+}
+
+fn relative_errors(truth: &Trajectory, estimate: &Trajectory, pairs: &[Pair], alignment: &Similarity) -> RelativeErrors {
+    let frame_period_s = median_period_s(estimate);
+    let mut steps = Vec::with_capacity(pairs.len());
+    for step in pairs.windows(2) {
+        let (from, to) = (step[0], step[1]);
+        let duration_s = estimate.poses[to.estimate].timestamp_s - estimate.poses[from.estimate].timestamp_s;
+        if from.truth == to.truth || duration_s <= 0.0 {
+            continue;
+        }
+        let motion = |a: &Se3, b: &Se3| a.inverse() * b;
+        let pose = |i: usize| alignment.transform_pose(&estimate.poses[i].world_from_camera);
+        let true_motion = motion(&truth.poses[from.truth].world_from_camera, &truth.poses[to.truth].world_from_camera);
+        let error = true_motion.inverse() * motion(&pose(from.estimate), &pose(to.estimate));
+        let frames = (duration_s / frame_period_s).round().max(1.0);
+        steps.push((error.translation.vector.norm(), error.rotation.angle().to_degrees(), frames, duration_s));
+    }
+    let rms = |of: fn(&(f64, f64, f64, f64)) -> f64| root_mean_square(steps.iter().map(of));
+    RelativeErrors {
+        steps: steps.len(),
+        trans_m_per_step: rms(|(metres, ..)| *metres),
+        rot_deg_per_step: rms(|(_, degrees, ..)| *degrees),
+        trans_m_per_frame: rms(|(metres, _, frames, _)| metres / frames),
+        rot_deg_per_frame: rms(|(_, degrees, frames, _)| degrees / frames),
+        trans_m_per_s: rms(|(metres, _, _, seconds)| metres / seconds),
+        rot_deg_per_s: rms(|(_, degrees, _, seconds)| degrees / seconds),
+    }
+}
+
+/// The usual time from one pose to the next: a frame's, as long as most frames have a pose.
+fn median_period_s(trajectory: &Trajectory) -> f64 {
+    let mut periods: Vec<f64> = trajectory.poses.windows(2).map(|w| w[1].timestamp_s - w[0].timestamp_s).collect();
+    periods.sort_by(f64::total_cmp);
+    periods.get(periods.len() / 2).copied().unwrap_or(f64::INFINITY)
+}
+
+/// Zero for no values.
+fn root_mean_square(values: impl ExactSizeIterator<Item = f64>) -> f64 {
+    let count = values.len().max(1) as f64;
+    (values.map(|value| value * value).sum::<f64>() / count).sqrt()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::{StampedPose, se3};
+    use nalgebra::Vector6;
+    use proptest::prelude::*;
+
+    fn path(stamps_s: impl IntoIterator<Item = f64>) -> Trajectory {
+        let pose = |t: f64| se3::exp(&Vector6::new(t.sin(), 0.3 * t, (0.7 * t).cos(), 0.2 * t, 0.1 * t.sin(), -0.1 * t));
+        Trajectory { poses: stamps_s.into_iter().map(|t| StampedPose { timestamp_s: t, world_from_camera: pose(t) }).collect() }
+    }
+
+    fn moved(trajectory: &Trajectory, tau: &Vector6<f64>, scale: f64) -> Trajectory {
+        let mut moved = trajectory.clone();
+        for pose in &mut moved.poses {
+            let mut pose_in_b = se3::exp(tau) * pose.world_from_camera;
+            pose_in_b.translation.vector *= scale;
+            pose.world_from_camera = pose_in_b;
+        }
+        moved
+    }
+
+    proptest! {
+        #[test]
+        fn a_moved_trajectory_has_no_error(tau in prop::array::uniform6(-2.0f64..2.0), scale in 0.1f64..10.0) {
+            let truth = path((0..40).map(|i| f64::from(i) * 0.1));
+            let tau = Vector6::from(tau);
+            let rigid = evaluate_trajectory(&truth, &moved(&truth, &tau, 1.0), Alignment::Rigid).unwrap();
+            prop_assert!(rigid.ate_rmse_m < 1e-12 && rigid.rpe.trans_m_per_frame < 1e-12 && rigid.rpe.rot_deg_per_frame < 1e-6);
+            let scaled = evaluate_trajectory(&truth, &moved(&truth, &tau, scale), Alignment::Similarity).unwrap();
+            prop_assert!(scaled.ate_rmse_m < 1e-11 && scaled.rpe.trans_m_per_frame < 1e-11);
+            prop_assert!((scaled.alignment.scale * scale - 1.0).abs() < 1e-11);
+        }
+
+        #[test]
+        fn no_small_motion_beats_the_alignment(tau in prop::array::uniform6(-0.1f64..0.1), seed in 0u64..1000) {
+            let mut rng = fastrand::Rng::with_seed(seed);
+            let mut point = || Vector3::from_fn(|_, _| rng.f64());
+            let from: Vec<_> = (0..6).map(|_| point()).collect();
+            let to: Vec<_> = (0..6).map(|_| point()).collect();
+            let best = align(&from, &to, Alignment::Rigid).unwrap();
+            let nudge = se3::exp(&Vector6::from(tau));
+            let cost = |f: &dyn Fn(&Vector3<f64>) -> Vector3<f64>| from.iter().zip(&to).map(|(a, b)| (f(a) - b).norm_squared()).sum::<f64>();
+            let nudged = cost(&|p| nudge.rotation * best.transform(p) + nudge.translation.vector);
+            prop_assert!(cost(&|p| best.transform(p)) <= nudged + 1e-12);
+        }
+    }
+
+    #[test]
+    fn steps_over_several_frames_are_divided_by_them() {
+        // An estimate that drifts by 2 mm in each frame of 0.1 s, against a camera that stands still: truth at every frame and
+        // truth at every 4th give the same rates.
+        let still = |stamps: Vec<f64>| Trajectory {
+            poses: stamps
+                .into_iter()
+                .map(|t| StampedPose { timestamp_s: t, world_from_camera: se3::exp(&Vector6::zeros()) })
+                .collect(),
+        };
+        let mut estimate = still((0..41).map(|i| f64::from(i) * 0.1).collect());
+        for (i, pose) in estimate.poses.iter_mut().enumerate() {
+            pose.world_from_camera.translation.vector.x = 0.002 * i as f64;
+        }
+        for every in [1, 4] {
+            let truth = still((0..41).step_by(every).map(|i| f64::from(i) * 0.1).collect());
+            let rpe = evaluate_trajectory(&truth, &estimate, Alignment::Rigid).unwrap().rpe;
+            assert!((rpe.trans_m_per_frame - 0.002).abs() < 1e-9, "{every}: {rpe:?}");
+            assert!((rpe.trans_m_per_s - 0.02).abs() < 1e-9, "{every}: {rpe:?}");
+            assert!((rpe.trans_m_per_step - 0.002 * every as f64).abs() < 1e-9, "{every}: {rpe:?}");
+        }
+    }
+
+    #[test]
+    fn association_takes_the_nearest_and_nothing_too_far() {
+        let truth = path([0.0, 0.1, 0.2, 0.3, 0.5]);
+        let estimate = path([0.015, 0.13, 0.19, 0.519]);
+        let pairs: Vec<_> = associate(&truth, &estimate, 0.02).iter().map(|p| (p.truth, p.estimate)).collect();
+        assert_eq!(pairs, [(0, 0), (2, 2), (4, 3)]);
+        assert!(associate(&truth, &Trajectory::default(), 0.02).is_empty());
+    }
+
+    #[test]
+    fn what_cannot_be_aligned_says_why() {
+        let truth = path([0.0, 1.0, 2.0]);
+        let few = evaluate_trajectory(&truth, &path([0.0, 1.0, 2.5]), Alignment::Rigid).unwrap_err();
+        assert!(few.to_string().starts_with("only 2 poses lie within 0.02 s"), "{few}");
+        let still = [Vector3::zeros(); 4];
+        assert_eq!(align(&still, &still, Alignment::Similarity), Err(AlignmentError::NoScale));
+        assert_eq!(align(&still, &still, Alignment::Rigid).unwrap().transform(&Vector3::zeros()), Vector3::zeros());
+    }
+}
