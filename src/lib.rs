@@ -4,3 +4,4 @@
 pub mod geometry;
 pub mod sequence;
 pub mod splat;
+pub mod tracking;
