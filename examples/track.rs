@@ -1,5 +1,6 @@
 //! Tracks a recorded sequence and says how well: `track <sequence folder> [trajectory.txt] [key=value …]` prints frames tracked,
-//! keyframes, ATE RMSE after SE(3) alignment, and the time per frame by stage. `key=value` sets a field of the tracking config.
+//! keyframes, ATE RMSE after SE(3) alignment, and the time per frame by stage. `key=value` sets a field of the
+//! tracking config; `every=N` takes every N-th frame.
 
 use std::error::Error;
 use std::path::Path;
@@ -15,8 +16,11 @@ const MAX_TIME_DIFFERENCE_S: f64 = 0.02;
 fn main() -> Result<(), Box<dyn Error>> {
     let (settings, paths): (Vec<String>, Vec<String>) = std::env::args().skip(1).partition(|a| a.contains('='));
     let folder = paths.first().ok_or("usage: track <sequence folder> [trajectory.txt] [key=value …]")?;
+    let (selection, settings): (Vec<String>, Vec<String>) = settings.into_iter().partition(|s| s.starts_with("every="));
+    let every = selection.first().map_or(Ok(1), |s| s["every=".len()..].parse())?;
     let config: TrackingConfig = toml::from_str(&settings.join("\n"))?;
-    let sequence = Sequence::open(Path::new(folder), None, None)?;
+    let mut sequence = Sequence::open(Path::new(folder), None, None)?;
+    sequence.select(None, every)?;
     let mut tracker = Tracker::new(sequence.camera, &config)?;
     let (mut times, mut lost, mut inliers) = (Vec::<StageTimes>::new(), Vec::new(), Vec::new());
     let mut shared = Vec::new();

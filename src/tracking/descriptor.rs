@@ -46,7 +46,7 @@ mod tests {
     #[test]
     fn the_representative_is_the_central_one() {
         let d = |bits: u32| Descriptor([(1u64 << bits) - 1, 0, 0, 0]);
-        assert_eq!(representative(&[d(0), d(5), d(40)]), Some(d(5)));
+        assert_eq!(representative(&[d(0), d(5), d(12), d(40), d(60)]), Some(d(5)));
         assert_eq!(representative(&[]), None);
     }
 }

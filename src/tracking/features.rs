@@ -193,17 +193,21 @@ mod tests {
         TrackingConfig { features: 500, ..Default::default() }
     }
 
-    /// Random bright and dark squares; the right half is scaled down to low contrast.
+    /// Random dots of many grey levels, blurred; the right half is of low contrast.
     fn picture() -> Vec<u8> {
         let mut random = fastrand::Rng::with_seed(7);
-        let tiles: Vec<u8> = (0..40 * 30).map(|_| random.u8(..)).collect();
-        let tile = |x: usize, y: usize| tiles[y / 8 * 40 + x / 8];
-        (0..320 * 240)
-            .map(|i| {
-                let (x, y) = (i % 320, i / 320);
-                if x < 160 { tile(x, y) } else { 120 + tile(x, y) / 16 }
-            })
-            .collect()
+        let mut dots: Vec<f64> = (0..320 * 240).map(|_| if random.u8(0..12) == 0 { 255.0 * random.f64() } else { 0.0 }).collect();
+        for (stride, length) in [(1, 320), (320, 240), (1, 320), (320, 240)] {
+            let sharp = dots.clone();
+            for (i, value) in dots.iter_mut().enumerate() {
+                let place = i / stride % length;
+                let before = if place > 0 { sharp[i - stride] } else { sharp[i] };
+                let after = if place + 1 < length { sharp[i + stride] } else { sharp[i] };
+                *value = (before + sharp[i] + after) * 0.55;
+            }
+        }
+        let contrast = |i: usize| if i % 320 < 160 { 1.0 } else { 0.08 };
+        dots.iter().enumerate().map(|(i, v)| (20.0 + v.min(200.0) * contrast(i)) as u8).collect()
     }
 
     #[test]

@@ -149,7 +149,7 @@ mod tests {
             let mut flipped = descriptor;
             (0..20).for_each(|_| flipped.0[random.usize(0..4)] ^= 1 << random.u32(0..64));
             let at = Vector2::new(20.0 + 600.0 * random.f64(), 20.0 + 440.0 * random.f64());
-            let turn = if i % 10 == 0 { 2.5 } else { 0.3 };
+            let turn = if i % 10 == 0 { 1.0 + 0.1 * (i / 10) as f32 } else { 0.3 };
             first.push(Feature { angle_rad: 6.2, ..feature(at.x, at.y, descriptor) });
             second.push(Feature { angle_rad: (6.2f32 + turn).rem_euclid(TAU), ..feature(at.x + 7.0, at.y - 4.0, flipped) });
         }

@@ -130,7 +130,7 @@ pub(super) mod tests {
                 pixel: Vector2::new(300.0, 200.0), inverse_depth: with_depth.then_some(0.4), pixel_weight: 0.7, depth_weight: 120.0,
             };
             let camera_from_world = se3::exp(&Vector6::from(tau));
-            let p_in_world = camera_from_world.inverse() * Vector3::new(p[0], p[1], p[2] + 3.0).into();
+            let p_in_world = camera_from_world.inverse() * nalgebra::Point3::new(p[0], p[1], p[2] + 3.0);
             let at = |pose: &Se3, point: &nalgebra::Point3<f64>| measurement.residual(&PINHOLE, &(pose * point).coords).unwrap();
             let p_in_camera = (camera_from_world * p_in_world).coords;
             let j = measurement.jacobian(&PINHOLE, &p_in_camera);
