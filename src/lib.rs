@@ -11,3 +11,4 @@ pub mod reference;
 pub mod render;
 pub mod sequence;
 pub mod splat;
+pub mod tracking;

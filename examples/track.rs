@@ -1,0 +1,115 @@
+//! Tracks a recorded sequence and says how well: `track <sequence folder> [trajectory.txt] [key=value …]` prints frames tracked,
+//! keyframes, ATE RMSE after SE(3) alignment, and the time per frame by stage. `key=value` sets a field of the
+//! tracking config; `every=N` takes every N-th frame.
+
+use std::error::Error;
+use std::path::Path;
+
+use keysplat::geometry::{StampedPose, Trajectory};
+use keysplat::sequence::Sequence;
+use keysplat::tracking::{StageTimes, Tracker, TrackingConfig, TrackingState};
+use nalgebra::{Matrix3, Vector3};
+
+/// Poses further apart in time than this are not compared.
+const MAX_TIME_DIFFERENCE_S: f64 = 0.02;
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let (settings, paths): (Vec<String>, Vec<String>) = std::env::args().skip(1).partition(|a| a.contains('='));
+    let folder = paths.first().ok_or("usage: track <sequence folder> [trajectory.txt] [key=value …]")?;
+    let (selection, settings): (Vec<String>, Vec<String>) = settings.into_iter().partition(|s| s.starts_with("every="));
+    let every = selection.first().map_or(Ok(1), |s| s["every=".len()..].parse())?;
+    let config: TrackingConfig = toml::from_str(&settings.join("\n"))?;
+    let mut sequence = Sequence::open(Path::new(folder), None, None)?;
+    sequence.select(None, every)?;
+    let mut tracker = Tracker::new(sequence.camera, &config)?;
+    let (mut times, mut lost, mut inliers) = (Vec::<StageTimes>::new(), Vec::new(), Vec::new());
+    let mut shared = Vec::new();
+    for index in 0..sequence.entries.len() {
+        let tracked = tracker.track(&sequence.load(index)?, true)?;
+        times.push(tracked.times);
+        inliers.push(tracked.inliers);
+        shared.extend(tracked.keyframe.map(|k| k.covisible.first().map_or(0, |c| c.1)));
+        if tracked.state == TrackingState::Lost {
+            lost.push(index);
+        }
+    }
+    let trajectory = Trajectory { poses: tracker.trajectory().into_iter().map(|(_, pose)| pose).collect() };
+    println!("tracked {}/{}, {} keyframes", trajectory.poses.len(), times.len(), tracker.keyframes().len());
+    if !lost.is_empty() {
+        println!("lost: {lost:?}");
+    }
+    inliers.sort_unstable();
+    println!("inliers: least {}, 5% {}, median {}", inliers[0], inliers[inliers.len() / 20], inliers[inliers.len() / 2]);
+    shared.sort_unstable();
+    println!("landmarks shared by neighbouring keyframes: median {}", shared[shared.len() / 2]);
+    if let Some(truth) = &sequence.groundtruth {
+        print_ate(&trajectory, truth);
+    }
+    print_times(&times);
+    if let Some(path) = paths.get(1) {
+        trajectory.write_tum(Path::new(path))?;
+    }
+    Ok(())
+}
+
+fn print_ate(trajectory: &Trajectory, truth: &Trajectory) {
+    let nearest = |t: f64| {
+        let by_time = |a: &&StampedPose, b: &&StampedPose| (a.timestamp_s - t).abs().total_cmp(&(b.timestamp_s - t).abs());
+        trajectory.poses.iter().min_by(by_time).filter(|p| (p.timestamp_s - t).abs() <= MAX_TIME_DIFFERENCE_S)
+    };
+    let pairs: Vec<(f64, Vector3<f64>, Vector3<f64>)> =
+        truth.poses.iter().filter_map(|t| nearest(t.timestamp_s).map(|p| (t.timestamp_s, position(p), position(t)))).collect();
+    if pairs.len() < 3 {
+        println!("too few poses with truth");
+        return;
+    }
+    let mean = |pick: fn(&(f64, Vector3<f64>, Vector3<f64>)) -> Vector3<f64>| {
+        pairs.iter().map(pick).sum::<Vector3<f64>>() / pairs.len() as f64
+    };
+    let (from_mean, to_mean) = (mean(|p| p.1), mean(|p| p.2));
+    let covariance: Matrix3<f64> = pairs.iter().map(|p| (p.2 - to_mean) * (p.1 - from_mean).transpose()).sum();
+    let svd = covariance.svd(true, true);
+    let (u, v_t) = (svd.u.unwrap_or_default(), svd.v_t.unwrap_or_default());
+    let flip = Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, (u * v_t).determinant().signum()));
+    let rotation = u * flip * v_t;
+    let errors: Vec<(f64, f64)> =
+        pairs.iter().map(|(t, from, to)| (*t, (rotation * (from - from_mean) + to_mean - to).norm())).collect();
+    let rmse = (errors.iter().map(|e| e.1 * e.1).sum::<f64>() / errors.len() as f64).sqrt();
+    let worst = errors.iter().max_by(|a, b| a.1.total_cmp(&b.1)).copied().unwrap_or_default();
+    // What scale would fit best says whether depth or drift is at fault.
+    let spread: f64 = pairs.iter().map(|p| (p.1 - from_mean).norm_squared()).sum();
+    let scale =
+        (rotation * pairs.iter().map(|p| (p.1 - from_mean) * (p.2 - to_mean).transpose()).sum::<Matrix3<f64>>()).trace() / spread;
+    println!(
+        "ATE RMSE {:.3} cm over {} poses, worst {:.2} cm at {:.2} s, best scale {scale:.4}",
+        rmse * 100.0,
+        errors.len(),
+        worst.1 * 100.0,
+        worst.0
+    );
+}
+
+fn position(pose: &StampedPose) -> Vector3<f64> {
+    pose.world_from_camera.translation.vector
+}
+
+fn print_times(times: &[StageTimes]) {
+    let row = |name: &str, pick: fn(&StageTimes) -> f64| {
+        let mut values: Vec<f64> = times.iter().map(pick).filter(|ms| *ms > 0.0).collect();
+        values.sort_by(f64::total_cmp);
+        let at = |share: f64| values.get((share * values.len() as f64) as usize).copied().unwrap_or_default();
+        let sum: f64 = values.iter().sum();
+        let (mean, per_frame) = (sum / values.len().max(1) as f64, sum / times.len() as f64);
+        println!(
+            "{name:>9} ms: median {:6.1}  mean {mean:6.1}  p95 {:6.1}  ({} times, {per_frame:.1} per frame)",
+            at(0.5),
+            at(0.95),
+            values.len()
+        );
+    };
+    row("total", StageTimes::total_ms);
+    row("features", |t| t.features_ms);
+    row("localise", |t| t.localise_ms);
+    row("mapping", |t| t.mapping_ms);
+    row("bundle", |t| t.bundle_ms);
+}

@@ -1,0 +1,222 @@
+//! The pose of one frame against the map: from the last frame's points where motion can be predicted, from a known view where not,
+//! then from the local map (Mur-Artal & Tardós, *ORB-SLAM2*, 2017).
+
+use nalgebra::Point3;
+
+use super::TrackingConfig;
+use super::frame_features::FrameFeatures;
+use super::map::Map;
+use super::matching::{Query, Rules, match_by_projection};
+use super::measurement::Trust;
+use super::pose::{PoseObservation, optimise_pose};
+use super::relocalise::{pose_from_view, similar_keyframes};
+use super::tracker::LastFrame;
+use crate::geometry::{Pinhole, Se3};
+
+/// Search radius around last frame's points, pixels at the finest level, widened in turn until enough are found.
+const MOTION_RADII: [f64; 3] = [8.0, 16.0, 32.0];
+const MOTION_RULES: Rules = Rules { max_distance: 80, ratio: 0.9, check_rotation: true };
+/// Matches with which a search is wide enough, and inliers with which its pose is believed enough to look at the map.
+const MOTION_MATCHES: usize = 40;
+const MOTION_INLIERS: usize = 15;
+/// Search radius around landmarks, pixels at the finest level: seen from about the known direction, and otherwise.
+const MAP_RADIUS_STRAIGHT: f64 = 5.0;
+const MAP_RADIUS_OBLIQUE: f64 = 8.0;
+/// Cosine of the angle up to which a view is straight.
+const STRAIGHT_COSINE: f64 = 0.998;
+/// The radius grows by this where the pose is rough.
+const ROUGH_FACTOR: f64 = 2.5;
+const MAP_RULES: Rules = Rules { max_distance: 80, ratio: 0.8, check_rotation: false };
+/// The local map: keyframes that see the frame's landmarks, and what these share most with.
+const LOCAL_KEYFRAMES: usize = 20;
+const LOCAL_SEEDS: usize = 5;
+const LOCAL_NEIGHBOURS: usize = 5;
+/// Keyframes tried when lost.
+const RELOCALISATION_KEYFRAMES: usize = 4;
+
+/// A frame with its pose found.
+#[derive(Clone, Debug)]
+pub struct Localised {
+    pub camera_from_world: Se3,
+    /// The landmark that each feature shows.
+    pub landmarks: Vec<Option<usize>>,
+    pub inliers: usize,
+    /// Whether the pose came without a prediction.
+    pub rough: bool,
+}
+
+/// What the searches need.
+pub struct Context<'a> {
+    pub map: &'a mut Map,
+    pub pinhole: &'a Pinhole,
+    pub config: &'a TrackingConfig,
+}
+
+impl Context<'_> {
+    /// From the last frame and the pose predicted for this one.
+    pub fn from_motion(&self, frame: &FrameFeatures, last: &LastFrame, predicted: &Se3) -> Option<Localised> {
+        let known = self.points_of(last);
+        let mut best: Option<Localised> = None;
+        for radius in MOTION_RADII {
+            let (mut asked, mut queries) = (Vec::new(), Vec::new());
+            for (index, feature) in last.features.features.iter().enumerate() {
+                let Some(point) = known[index] else { continue };
+                let p_in_camera = (predicted * point).coords;
+                let Some(pixel) = self.pinhole.project(&p_in_camera).filter(|p| self.pinhole.contains(p, 0.0)) else { continue };
+                asked.push(index);
+                queries.push(Query {
+                    pixel,
+                    radius: radius * self.config.pyramid_scale.powi(feature.octave.into()),
+                    octaves: feature.octave.saturating_sub(1)..=feature.octave + 1,
+                    descriptor: feature.descriptor,
+                    angle_rad: feature.angle_rad,
+                    inverse_depth: 1.0 / p_in_camera.z,
+                });
+            }
+            let matches = match_by_projection(frame, &[], &queries, &MOTION_RULES);
+            let enough = matches.len() >= MOTION_MATCHES;
+            let pairs: Vec<(usize, usize)> = matches.iter().map(|m| (asked[m.query], m.feature)).collect();
+            let found = self.settle(frame, predicted, &pairs, &known, |i| last.landmarks[i]);
+            if best.as_ref().is_none_or(|b| found.inliers > b.inliers) {
+                best = Some(found);
+            }
+            if enough && best.as_ref().is_some_and(|b| 2 * b.inliers >= matches.len()) {
+                break;
+            }
+        }
+        best.filter(|b| b.inliers >= MOTION_INLIERS)
+    }
+
+    /// From the last frame without a prediction.
+    pub fn from_last(&self, frame: &FrameFeatures, last: &LastFrame) -> Option<Localised> {
+        let known = self.points_of(last);
+        self.from_view(frame, &last.features, &known, |i| last.landmarks[i])
+    }
+
+    /// From a keyframe's landmarks without a prediction.
+    pub fn from_keyframe(&self, frame: &FrameFeatures, keyframe: usize) -> Option<Localised> {
+        let view = &self.map.keyframes[keyframe];
+        let known: Vec<Option<Point3<f64>>> = view.landmarks.iter().map(|l| l.map(|l| self.map.landmarks[l].position)).collect();
+        self.from_view(frame, &view.features, &known, |i| view.landmarks[i])
+    }
+
+    /// From the map alone, when lost: `reference` and the keyframes that look most alike; the best of them.
+    pub fn from_anywhere(&mut self, frame: &FrameFeatures, reference: usize) -> Option<Localised> {
+        let mut tried = vec![reference];
+        tried.extend(similar_keyframes(self.map, frame, RELOCALISATION_KEYFRAMES).into_iter().filter(|k| *k != reference));
+        let mut best: Option<Localised> = None;
+        for keyframe in tried {
+            let Some(rough) = self.from_keyframe(frame, keyframe) else { continue };
+            let found = self.in_local_map(frame, &rough, keyframe);
+            if best.as_ref().is_none_or(|b| found.inliers > b.inliers) {
+                best = Some(found);
+            }
+        }
+        best
+    }
+
+    /// Refines a pose with all landmarks around it.
+    pub fn in_local_map(&mut self, frame: &FrameFeatures, start: &Localised, reference: usize) -> Localised {
+        let mut taken: Vec<bool> = start.landmarks.iter().map(Option::is_some).collect();
+        let mut pairs: Vec<(usize, usize)> =
+            start.landmarks.iter().enumerate().filter_map(|(feature, l)| l.map(|l| (l, feature))).collect();
+        let mut matched = vec![false; self.map.landmarks.len()];
+        pairs.iter().for_each(|(l, _)| matched[*l] = true);
+        let (mut asked, mut queries) = (Vec::new(), Vec::new());
+        for l in self.local_landmarks(start, reference) {
+            let Some(seen) = self.map.predict(l, &start.camera_from_world, self.pinhole, self.config) else { continue };
+            self.map.landmarks[l].visible += 1;
+            if matched[l] {
+                continue;
+            }
+            let base = if seen.view_cosine > STRAIGHT_COSINE { MAP_RADIUS_STRAIGHT } else { MAP_RADIUS_OBLIQUE };
+            let factor = if start.rough { ROUGH_FACTOR } else { 1.0 };
+            asked.push(l);
+            queries.push(Query {
+                pixel: seen.pixel,
+                radius: base * factor * self.config.pyramid_scale.powi(seen.octave.into()),
+                octaves: seen.octave.saturating_sub(1)..=seen.octave,
+                descriptor: self.map.landmarks[l].descriptor,
+                angle_rad: 0.0,
+                inverse_depth: seen.inverse_depth,
+            });
+        }
+        for m in match_by_projection(frame, &taken, &queries, &MAP_RULES) {
+            taken[m.feature] = true;
+            pairs.push((asked[m.query], m.feature));
+        }
+        let positions: Vec<Option<Point3<f64>>> = self.map.landmarks.iter().map(|l| Some(l.position)).collect();
+        let mut found = self.settle(frame, &start.camera_from_world, &pairs, &positions, Some);
+        found.rough = start.rough;
+        for l in found.landmarks.iter().flatten() {
+            self.map.landmarks[*l].found += 1;
+        }
+        found
+    }
+
+    /// Optimises a pose over pairs (index into `known`, feature) and keeps the landmarks that agree.
+    fn settle(
+        &self,
+        frame: &FrameFeatures,
+        initial: &Se3,
+        pairs: &[(usize, usize)],
+        known: &[Option<Point3<f64>>],
+        landmark_of: impl Fn(usize) -> Option<usize>,
+    ) -> Localised {
+        let mut landmarks = vec![None; frame.len()];
+        let usable: Vec<(usize, usize, PoseObservation)> = pairs
+            .iter()
+            .filter_map(|(source, feature)| {
+                let measurement = frame.features[*feature].measurement(self.config);
+                known[*source].map(|point_in_world| (*source, *feature, PoseObservation { point_in_world, measurement }))
+            })
+            .collect();
+        let observations: Vec<PoseObservation> = usable.iter().map(|u| u.2).collect();
+        let estimate = optimise_pose(self.pinhole, initial, &observations);
+        for ((source, feature, _), trust) in usable.iter().zip(&estimate.trust) {
+            if *trust != Trust::Outlier {
+                landmarks[*feature] = landmark_of(*source);
+            }
+        }
+        Localised { camera_from_world: estimate.camera_from_world, landmarks, inliers: estimate.inliers, rough: false }
+    }
+
+    fn from_view(
+        &self,
+        frame: &FrameFeatures,
+        view: &FrameFeatures,
+        known: &[Option<Point3<f64>>],
+        landmark_of: impl Fn(usize) -> Option<usize>,
+    ) -> Option<Localised> {
+        let rough = pose_from_view(&view.features, known, frame, self.pinhole)?;
+        let pairs: Vec<(usize, usize)> = rough.matches.iter().map(|m| (m.query, m.feature)).collect();
+        let mut found = self.settle(frame, &rough.camera_from_world, &pairs, known, landmark_of);
+        found.rough = true;
+        (found.inliers >= MOTION_INLIERS).then_some(found)
+    }
+
+    /// Points of the last frame's features in the world: landmarks, and for the others temporary points from depth.
+    fn points_of(&self, last: &LastFrame) -> Vec<Option<Point3<f64>>> {
+        let world_from_camera = last.camera_from_world.inverse();
+        let temporary = |i| last.features.point_in_camera(i, self.pinhole).map(|p| world_from_camera * p);
+        (0..last.features.len())
+            .map(|i| last.landmarks[i].map(|l| self.map.landmarks[l].position).or_else(|| temporary(i)))
+            .collect()
+    }
+
+    fn local_landmarks(&self, start: &Localised, reference: usize) -> Vec<usize> {
+        let seeds = self.map.votes(start.landmarks.iter().flatten().copied());
+        let mut keyframes: Vec<usize> = seeds.iter().take(LOCAL_KEYFRAMES).map(|(k, _)| *k).collect();
+        if !keyframes.contains(&reference) {
+            keyframes.push(reference);
+        }
+        for (seed, _) in seeds.iter().take(LOCAL_SEEDS) {
+            for (neighbour, _) in self.map.covisible(*seed).into_iter().take(LOCAL_NEIGHBOURS) {
+                if !keyframes.contains(&neighbour) {
+                    keyframes.push(neighbour);
+                }
+            }
+        }
+        self.map.landmarks_of(&keyframes)
+    }
+}

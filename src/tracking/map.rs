@@ -1,0 +1,320 @@
+//! The sparse map: keyframes, landmarks, who sees what, and the covisibility that follows from it.
+//!
+//! Everything is indexed by its place in a `Vec` (ids never change and are never reused), so every walk has one order.
+
+use std::sync::Arc;
+
+use nalgebra::{Point3, Vector2, Vector3};
+
+use super::TrackingConfig;
+use super::descriptor::{Descriptor, representative};
+use super::frame_features::FrameFeatures;
+use crate::geometry::{Pinhole, Se3};
+
+/// A landmark is looked for only within 60° of the mean direction from which it was seen.
+const MIN_VIEW_COSINE: f64 = 0.5;
+/// Slack on the range of distances at which the pyramid can see a landmark.
+const RANGE_SLACK: f64 = 1.2;
+/// A landmark's descriptor is chosen among those of its latest observations.
+const DESCRIPTORS_COMPARED: usize = 10;
+
+/// Feature `feature` of keyframe `keyframe` shows a landmark.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Sighting {
+    pub keyframe: usize,
+    pub feature: usize,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Fate {
+    Alive,
+    Removed,
+    /// It turned out to be another landmark.
+    MergedInto(usize),
+}
+
+#[derive(Clone, Debug)]
+pub struct Landmark {
+    /// In the world, metres.
+    pub position: Point3<f64>,
+    pub descriptor: Descriptor,
+    /// Mean direction from the cameras to it, unit length.
+    pub view_direction: Vector3<f64>,
+    /// Nearest and furthest distance at which the pyramid shows it as it was seen, metres.
+    pub range: (f64, f64),
+    /// At most one per keyframe, in order of arrival.
+    pub sightings: Vec<Sighting>,
+    /// Keyframe that made it.
+    pub born: usize,
+    /// Frames in which it should have been seen, and was.
+    pub visible: u32,
+    pub found: u32,
+    pub fate: Fate,
+}
+
+#[derive(Clone, Debug)]
+pub struct Keyframe {
+    pub frame_index: usize,
+    pub timestamp_s: f64,
+    pub camera_from_world: Se3,
+    pub features: Arc<FrameFeatures>,
+    /// The landmark that each feature shows.
+    pub landmarks: Vec<Option<usize>>,
+}
+
+/// Where a landmark should appear.
+#[derive(Clone, Copy, Debug)]
+pub struct Prediction {
+    pub pixel: Vector2<f64>,
+    pub octave: u8,
+    /// Cosine between the line of sight and the landmark's mean one.
+    pub view_cosine: f64,
+    pub inverse_depth: f64,
+}
+
+#[derive(Clone, Debug, Default)]
+pub struct Map {
+    pub keyframes: Vec<Keyframe>,
+    pub landmarks: Vec<Landmark>,
+}
+
+impl Map {
+    /// A landmark first seen by `sighting`.
+    pub fn add_landmark(&mut self, sighting: Sighting, position: Point3<f64>, config: &TrackingConfig) -> usize {
+        let id = self.landmarks.len();
+        self.landmarks.push(Landmark {
+            position,
+            descriptor: self.keyframes[sighting.keyframe].features.features[sighting.feature].descriptor,
+            view_direction: Vector3::z(),
+            range: (0.0, f64::INFINITY),
+            sightings: vec![sighting],
+            born: sighting.keyframe,
+            visible: 1,
+            found: 1,
+            fate: Fate::Alive,
+        });
+        self.keyframes[sighting.keyframe].landmarks[sighting.feature] = Some(id);
+        self.refresh_geometry(id, config);
+        id
+    }
+
+    /// Records that a keyframe sees a landmark. Nothing changes if either is already spoken for.
+    pub fn add_sighting(&mut self, landmark: usize, sighting: Sighting) {
+        let slot = &mut self.keyframes[sighting.keyframe].landmarks[sighting.feature];
+        if slot.is_none() && !self.landmarks[landmark].seen_by(sighting.keyframe) {
+            *slot = Some(landmark);
+            self.landmarks[landmark].sightings.push(sighting);
+        }
+    }
+
+    /// Takes a sighting back; a landmark that nobody sees any more is removed.
+    pub fn remove_sighting(&mut self, landmark: usize, sighting: Sighting) {
+        self.keyframes[sighting.keyframe].landmarks[sighting.feature] = None;
+        let sightings = &mut self.landmarks[landmark].sightings;
+        sightings.retain(|s| *s != sighting);
+        if sightings.is_empty() {
+            self.landmarks[landmark].fate = Fate::Removed;
+        }
+    }
+
+    pub fn remove_landmark(&mut self, landmark: usize) {
+        for sighting in std::mem::take(&mut self.landmarks[landmark].sightings) {
+            self.keyframes[sighting.keyframe].landmarks[sighting.feature] = None;
+        }
+        self.landmarks[landmark].fate = Fate::Removed;
+    }
+
+    /// `from` is the same point as `into`, which takes over its sightings.
+    pub fn merge(&mut self, from: usize, into: usize) {
+        if from == into || self.landmarks[from].fate != Fate::Alive || self.landmarks[into].fate != Fate::Alive {
+            return;
+        }
+        for sighting in std::mem::take(&mut self.landmarks[from].sightings) {
+            self.keyframes[sighting.keyframe].landmarks[sighting.feature] = None;
+            self.add_sighting(into, sighting);
+        }
+        let (visible, found) = (self.landmarks[from].visible, self.landmarks[from].found);
+        self.landmarks[from].fate = Fate::MergedInto(into);
+        self.landmarks[into].visible += visible;
+        self.landmarks[into].found += found;
+    }
+
+    /// The living landmark that `landmark` has become, if any.
+    pub fn resolve(&self, landmark: usize) -> Option<usize> {
+        let mut id = landmark;
+        loop {
+            match self.landmarks[id].fate {
+                Fate::Alive => return Some(id),
+                Fate::Removed => return None,
+                Fate::MergedInto(next) => id = next,
+            }
+        }
+    }
+
+    /// Chooses a landmark's descriptor among its latest sightings.
+    pub fn refresh_descriptor(&mut self, landmark: usize) {
+        let latest = self.landmarks[landmark].sightings.iter().rev().take(DESCRIPTORS_COMPARED);
+        let descriptors: Vec<Descriptor> =
+            latest.map(|s| self.keyframes[s.keyframe].features.features[s.feature].descriptor).collect();
+        if let Some(descriptor) = representative(&descriptors) {
+            self.landmarks[landmark].descriptor = descriptor;
+        }
+    }
+
+    /// Works out again what follows from a landmark's position and sightings: its direction and range.
+    pub fn refresh_geometry(&mut self, landmark: usize, config: &TrackingConfig) {
+        let l = &self.landmarks[landmark];
+        let (Some(first), Fate::Alive) = (l.sightings.first(), l.fate) else { return };
+        let mut direction = Vector3::zeros();
+        for sighting in &l.sightings {
+            let line = l.position - self.keyframes[sighting.keyframe].centre();
+            direction += line.try_normalize(1e-9).unwrap_or_default();
+        }
+        let keyframe = &self.keyframes[first.keyframe];
+        let scale = |octave: usize| config.pyramid_scale.powi(octave as i32);
+        let octave = usize::from(keyframe.features.features[first.feature].octave);
+        let furthest = (l.position - keyframe.centre()).norm() * scale(octave);
+        let view_direction = direction.try_normalize(1e-9).unwrap_or(l.view_direction);
+        let l = &mut self.landmarks[landmark];
+        l.view_direction = view_direction;
+        l.range = (furthest / scale(config.pyramid_levels - 1), furthest);
+    }
+
+    /// Where a camera should see a landmark; `None` if it should not.
+    pub fn predict(
+        &self,
+        landmark: usize,
+        camera_from_world: &Se3,
+        pinhole: &Pinhole,
+        config: &TrackingConfig,
+    ) -> Option<Prediction> {
+        let l = &self.landmarks[landmark];
+        let p_in_camera = (camera_from_world * l.position).coords;
+        let pixel = pinhole.project(&p_in_camera).filter(|pixel| pinhole.contains(pixel, 0.0))?;
+        let distance = p_in_camera.norm();
+        if distance < l.range.0 / RANGE_SLACK || distance > l.range.1 * RANGE_SLACK {
+            return None;
+        }
+        let line_of_sight = camera_from_world.rotation.inverse() * p_in_camera / distance;
+        let view_cosine = line_of_sight.dot(&l.view_direction);
+        if view_cosine < MIN_VIEW_COSINE {
+            return None;
+        }
+        let octave = ((l.range.1 / distance).ln() / config.pyramid_scale.ln()).ceil();
+        let octave = octave.clamp(0.0, config.pyramid_levels as f64 - 1.0) as u8;
+        Some(Prediction { pixel, octave, view_cosine, inverse_depth: 1.0 / p_in_camera.z })
+    }
+
+    /// Keyframes that see the given landmarks and how many of them, most first, then newest first.
+    pub fn votes(&self, landmarks: impl Iterator<Item = usize>) -> Vec<(usize, usize)> {
+        let mut counts = vec![0usize; self.keyframes.len()];
+        for landmark in landmarks {
+            self.landmarks[landmark].sightings.iter().for_each(|s| counts[s.keyframe] += 1);
+        }
+        let mut ranked: Vec<(usize, usize)> = counts.into_iter().enumerate().filter(|(_, count)| *count > 0).collect();
+        ranked.sort_by_key(|(keyframe, count)| (std::cmp::Reverse(*count), std::cmp::Reverse(*keyframe)));
+        ranked
+    }
+
+    /// Keyframes that share landmarks with a keyframe and how many, strongest first.
+    pub fn covisible(&self, keyframe: usize) -> Vec<(usize, usize)> {
+        let mut ranked = self.votes(self.keyframes[keyframe].landmarks.iter().flatten().copied());
+        ranked.retain(|(other, _)| *other != keyframe);
+        ranked
+    }
+
+    /// The landmarks of some keyframes, each once, in order of first mention.
+    pub fn landmarks_of(&self, keyframes: &[usize]) -> Vec<usize> {
+        let mut seen = vec![false; self.landmarks.len()];
+        let all = keyframes.iter().flat_map(|k| self.keyframes[*k].landmarks.iter().flatten().copied());
+        all.filter(|l| !std::mem::replace(&mut seen[*l], true)).collect()
+    }
+}
+
+impl Landmark {
+    pub fn seen_by(&self, keyframe: usize) -> bool {
+        self.sightings.iter().any(|s| s.keyframe == keyframe)
+    }
+}
+
+impl Keyframe {
+    /// The camera's centre in the world, metres.
+    pub fn centre(&self) -> Point3<f64> {
+        self.camera_from_world.inverse_transform_point(&Point3::origin())
+    }
+
+    /// The camera's viewing direction in the world.
+    pub fn forward(&self) -> Vector3<f64> {
+        self.camera_from_world.rotation.inverse() * Vector3::z()
+    }
+
+    /// How many landmarks it sees that at least `sightings` keyframes see.
+    pub fn landmark_count(&self, map: &Map, sightings: usize) -> usize {
+        self.landmarks.iter().flatten().filter(|l| map.landmarks[**l].sightings.len() >= sightings).count()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::frame_features::tests::feature;
+    use super::super::measurement::tests::PINHOLE;
+    use super::*;
+
+    fn config() -> TrackingConfig {
+        TrackingConfig::default()
+    }
+
+    /// Three keyframes of ten features each, at one place.
+    fn map() -> Map {
+        let list = (0..10).map(|i| feature(50.0 * f64::from(i), 100.0, Descriptor([1 << i, 0, 0, 0]))).collect();
+        let features = Arc::new(FrameFeatures::new(list, Vec::new(), &PINHOLE));
+        let keyframe = Keyframe {
+            frame_index: 0,
+            timestamp_s: 0.0,
+            camera_from_world: Se3::identity(),
+            features,
+            landmarks: vec![None; 10],
+        };
+        Map { keyframes: vec![keyframe; 3], landmarks: Vec::new() }
+    }
+
+    fn at(keyframe: usize, feature: usize) -> Sighting {
+        Sighting { keyframe, feature }
+    }
+
+    #[test]
+    fn merging_moves_sightings_and_keeps_both_sides_in_step() {
+        let mut map = map();
+        let a = map.add_landmark(at(0, 1), Point3::new(0.0, 0.0, 2.0), &config());
+        let b = map.add_landmark(at(1, 2), Point3::new(0.0, 0.0, 2.0), &config());
+        map.add_sighting(b, at(2, 3));
+        map.add_sighting(b, at(2, 4)); // a second one in the same keyframe
+        assert_eq!(map.covisible(1), [(2, 1)]);
+        map.merge(b, a);
+        assert_eq!(map.resolve(b), Some(a));
+        assert_eq!(map.landmarks[a].sightings, [at(0, 1), at(1, 2), at(2, 3)]);
+        assert_eq!((map.keyframes[1].landmarks[2], map.keyframes[2].landmarks[4]), (Some(a), None));
+        assert_eq!(map.covisible(0), [(2, 1), (1, 1)]);
+        map.remove_sighting(a, at(0, 1));
+        map.remove_landmark(a);
+        assert_eq!(map.resolve(b), None);
+        assert!(map.keyframes.iter().all(|k| k.landmarks.iter().all(Option::is_none)));
+    }
+
+    #[test]
+    fn a_landmark_is_predicted_where_and_how_large_it_was_seen() {
+        let mut map = map();
+        let id = map.add_landmark(at(0, 1), Point3::new(0.0, 0.0, 2.0), &config());
+        let predict = |pose: &Se3| map.predict(id, pose, &PINHOLE, &config());
+        let here = predict(&Se3::identity()).unwrap();
+        assert_eq!((here.octave, here.inverse_depth), (0, 0.5));
+        assert!((here.pixel - Vector2::new(320.5, 241.0)).norm() < 1e-9);
+        // Half the distance shows it twice as large: 4 levels of 1.2 up.
+        assert_eq!(predict(&Se3::translation(0.0, 0.0, -1.0)).unwrap().octave, 4);
+        assert!(predict(&Se3::translation(0.0, 0.0, 2.0)).is_none(), "too small to see");
+        assert!(predict(&Se3::translation(9.0, 0.0, 0.0)).is_none(), "out of the image");
+        // From behind.
+        let behind = Se3::new(Vector3::new(0.0, 0.0, 4.0), Vector3::y() * std::f64::consts::PI);
+        assert!(predict(&behind).is_none());
+    }
+}

@@ -1,0 +1,98 @@
+//! RGB-D tracking from ORB features, after the tracking and local mapping of ORB-SLAM2 (Mur-Artal & Tardós, *IEEE T-RO* 2017) in our
+//! own code: features and PnP are OpenCV's, everything else is here.
+//!
+//! One frame: features with depth → the pose predicted from the last motion → last frame's points → the local map. Now and then a
+//! keyframe: landmarks from depth, joined with what its neighbours see → local bundle adjustment. All in the caller's thread, in one
+//! fixed order: the same frames give the same bits. Knows nothing of the mapper or the GPU.
+
+mod bundle;
+mod config;
+mod descriptor;
+mod error;
+mod features;
+mod frame_features;
+mod keyframe;
+mod localise;
+mod map;
+mod mapping;
+mod matching;
+mod measurement;
+mod pose;
+mod relocalise;
+mod spread;
+mod tracker;
+mod window;
+
+pub use config::TrackingConfig;
+pub use error::TrackingError;
+pub use tracker::Tracker;
+
+use crate::geometry::Se3;
+
+/// Whether a frame has a pose.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum TrackingState {
+    Tracking,
+    /// No pose that can be trusted; the frame left no trace in the map.
+    Lost,
+}
+
+/// What tracking says of one frame.
+#[derive(Clone, Debug)]
+pub struct TrackedFrame {
+    pub state: TrackingState,
+    /// As of now; later keyframe corrections move it (see [`Tracker::trajectory`]). `None` when lost.
+    pub world_from_camera: Option<Se3>,
+    /// Landmarks that agree with the pose.
+    pub inliers: usize,
+    /// Set if this frame became a keyframe.
+    pub keyframe: Option<NewKeyframe>,
+    /// Earlier keyframes that bundle adjustment moved: id, new world_from_camera.
+    pub updates: Vec<(usize, Se3)>,
+    /// Where the time went; the only part of the answer that differs from run to run.
+    pub times: StageTimes,
+}
+
+/// A frame that became a keyframe.
+#[derive(Clone, Debug, PartialEq)]
+pub struct NewKeyframe {
+    /// Counts from 0 in the order of creation.
+    pub id: usize,
+    pub world_from_camera: Se3,
+    /// Other keyframes (id) and how many landmarks they share with this one, strongest first.
+    pub covisible: Vec<(usize, usize)>,
+}
+
+/// A keyframe as currently estimated.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct KeyframePose {
+    pub id: usize,
+    pub frame_index: usize,
+    pub timestamp_s: f64,
+    pub world_from_camera: Se3,
+}
+
+/// Wall-clock time of each stage, milliseconds; 0 where it did not run.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct StageTimes {
+    /// ORB extraction and depth lookup.
+    pub features_ms: f64,
+    /// Matching and pose optimisation.
+    pub localise_ms: f64,
+    /// New landmarks, joining with neighbours.
+    pub mapping_ms: f64,
+    /// Local bundle adjustment.
+    pub bundle_ms: f64,
+}
+
+impl StageTimes {
+    pub fn total_ms(&self) -> f64 {
+        self.features_ms + self.localise_ms + self.mapping_ms + self.bundle_ms
+    }
+}
+
+impl TrackedFrame {
+    fn lost(times: StageTimes) -> Self {
+        Self { state: TrackingState::Lost, world_from_camera: None, inliers: 0, keyframe: None, updates: Vec::new(), times }
+    }
+}
