@@ -4,6 +4,7 @@
 
 mod cameras;
 mod rectify;
+pub mod synthetic;
 mod tum;
 
 use std::path::{Path, PathBuf};

@@ -1,0 +1,234 @@
+//! The scene file: everything that decides what is rendered, with its defaults and its checks.
+
+use serde::{Deserialize, Serialize};
+
+use super::SceneError;
+
+/// What to render. Two scenes that are equal give the same recording to the byte.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SceneConfig {
+    /// Decides the furnishing, the textures, the hand's shake and the sensor's noise.
+    pub seed: u64,
+    pub frames: usize,
+    /// Frames per second.
+    pub fps: f64,
+    pub camera: CameraConfig,
+    pub room: RoomConfig,
+    pub furniture: FurnitureConfig,
+    pub path: PathConfig,
+    pub degradation: DegradationConfig,
+}
+
+impl Default for SceneConfig {
+    fn default() -> Self {
+        Self {
+            seed: 1,
+            frames: 160,
+            fps: 30.0,
+            camera: CameraConfig::default(),
+            room: RoomConfig::default(),
+            furniture: FurnitureConfig::default(),
+            path: PathConfig::default(),
+            degradation: DegradationConfig::default(),
+        }
+    }
+}
+
+/// The recording camera: pixels, and OpenCV's lens coefficients. The recorded images show the lens.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct CameraConfig {
+    pub width: u32,
+    pub height: u32,
+    pub fx: f64,
+    pub fy: f64,
+    pub cx: f64,
+    pub cy: f64,
+    pub k1: f64,
+    pub k2: f64,
+    pub p1: f64,
+    pub p2: f64,
+}
+
+impl Default for CameraConfig {
+    fn default() -> Self {
+        let (width, height) = (640, 480);
+        Self { width, height, fx: 525.0, fy: 525.0, cx: 319.5, cy: 239.5, k1: 0.0, k2: 0.0, p1: 0.0, p2: 0.0 }
+    }
+}
+
+/// The room, metres.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RoomConfig {
+    pub width: f64,
+    pub depth: f64,
+    pub height: f64,
+    /// 0 for purely diffuse surfaces, whose look does not depend on where one stands; up to 1 for highlights on wood, glaze, metal.
+    pub gloss: f64,
+}
+
+impl Default for RoomConfig {
+    fn default() -> Self {
+        Self { width: 6.0, depth: 5.2, height: 2.7, gloss: 0.0 }
+    }
+}
+
+/// How many of each piece stand in the room.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct FurnitureConfig {
+    /// Desks and dining tables in turn.
+    pub tables: usize,
+    pub shelves: usize,
+    pub sofas: usize,
+    pub cabinets: usize,
+    /// Standard lamps.
+    pub lamps: usize,
+    pub plants: usize,
+    /// Stacks of packing boxes.
+    pub boxes: usize,
+    pub rugs: usize,
+    /// Posters and paintings on the walls.
+    pub pictures: usize,
+    pub windows: usize,
+}
+
+impl Default for FurnitureConfig {
+    fn default() -> Self {
+        Self { tables: 2, shelves: 2, sofas: 1, cabinets: 2, lamps: 2, plants: 2, boxes: 2, rugs: 1, pictures: 9, windows: 1 }
+    }
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum PathKind {
+    /// To and fro before one corner of the room, turning across it.
+    Sweep,
+    /// Round the room, looking outwards, back to the start.
+    Loop,
+}
+
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct PathConfig {
+    pub kind: PathKind,
+    /// Times round the room, for a loop; the last frame is back at the start.
+    pub rounds: u32,
+    /// The most that the path itself, without the hand's shake, moves, m/s. A sweep goes at the pace that this and the turning
+    /// rate allow together; a loop takes as long as there are frames.
+    pub speed: f64,
+    /// The most that the path itself turns, degrees/s.
+    pub turn_rate: f64,
+    /// Mean height of the camera above the floor, metres.
+    pub height: f64,
+    /// The hand's shake: about its largest excursion, in metres and in degrees.
+    pub shake_metres: f64,
+    pub shake_degrees: f64,
+}
+
+impl Default for PathConfig {
+    fn default() -> Self {
+        let kind = PathKind::Sweep;
+        Self { kind, rounds: 1, speed: 0.4, turn_rate: 28.0, height: 1.35, shake_metres: 0.01, shake_degrees: 1.0 }
+    }
+}
+
+/// What goes wrong on the way to the file. Everything is off by default.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct DegradationConfig {
+    /// Standard deviation of the colour noise, in 8-bit levels.
+    pub image_noise: f64,
+    /// Depth noise has the standard deviation `depth_noise * z²` (metres, `z` in metres), as structured light has it.
+    pub depth_noise: f64,
+    /// Share of the frame interval for which the shutter is open, `0..=1`. The stamped pose is that of the exposure's middle.
+    pub motion_blur: f64,
+    /// Slow drift of gain and white balance: about its largest excursion, in natural-logarithmic units.
+    pub exposure_drift: f64,
+    /// Share of depth pixels lost in blobs. Where it is not 0, grazing surfaces are lost too.
+    pub missing_depth: f64,
+    /// Depth beyond this is not measured, metres; 0 for no limit.
+    pub max_range: f64,
+    /// A textured thing that travels to and fro through the room.
+    pub moving_object: bool,
+    /// Its speed, m/s; 0 for a pace of 0.4.
+    pub moving_speed: f64,
+    /// Frames `from..to` are black, while the camera moves on.
+    pub covered: Option<[usize; 2]>,
+}
+
+/// More pixels than this a frame would take minutes to render, and is surely a slip of the pen.
+const MAX_SIDE: u32 = 8192;
+/// More frames than this is an hour at 30 Hz.
+const MAX_FRAMES: usize = 108_000;
+
+impl SceneConfig {
+    /// Checks each field on its own; whether the furniture fits and the path is clear shows when the scene is built.
+    pub fn validate(&self) -> Result<(), SceneError> {
+        self.validate_camera()?;
+        let room = &self.room;
+        within("room.width", room.width, 3.5, 12.0)?;
+        within("room.depth", room.depth, 3.5, 12.0)?;
+        within("room.height", room.height, 2.2, 5.0)?;
+        within("room.gloss", room.gloss, 0.0, 1.0)?;
+        let path = &self.path;
+        within("path.speed", path.speed, 0.01, 5.0)?;
+        within("path.turn_rate", path.turn_rate, 0.5, 360.0)?;
+        within("path.height", path.height, 0.8, room.height - 0.6)?;
+        within("path.shake_metres", path.shake_metres, 0.0, 0.05)?;
+        within("path.shake_degrees", path.shake_degrees, 0.0, 10.0)?;
+        within("path.rounds", f64::from(path.rounds), 1.0, 100.0)?;
+        self.validate_degradation()?;
+        let f = &self.furniture;
+        let counts = [f.tables, f.shelves, f.sofas, f.cabinets, f.lamps, f.plants, f.boxes, f.rugs, f.pictures, f.windows];
+        within("furniture (pieces in all)", counts.iter().fold(0usize, |sum, n| sum.saturating_add(*n)) as f64, 0.0, 100.0)
+    }
+
+    fn validate_camera(&self) -> Result<(), SceneError> {
+        within("frames", self.frames as f64, 1.0, MAX_FRAMES as f64)?;
+        within("fps", self.fps, 1.0, 1000.0)?;
+        let c = &self.camera;
+        within("camera.width", f64::from(c.width), 8.0, f64::from(MAX_SIDE))?;
+        within("camera.height", f64::from(c.height), 8.0, f64::from(MAX_SIDE))?;
+        let side = f64::from(c.width.max(c.height));
+        within("camera.fx", c.fx, 0.2 * side, 20.0 * side)?;
+        within("camera.fy", c.fy, 0.2 * side, 20.0 * side)?;
+        within("camera.cx", c.cx, 0.0, f64::from(c.width))?;
+        within("camera.cy", c.cy, 0.0, f64::from(c.height))?;
+        for (field, value) in [("camera.k1", c.k1), ("camera.k2", c.k2)] {
+            within(field, value, -2.0, 2.0)?;
+        }
+        for (field, value) in [("camera.p1", c.p1), ("camera.p2", c.p2)] {
+            within(field, value, -0.1, 0.1)?;
+        }
+        Ok(())
+    }
+
+    fn validate_degradation(&self) -> Result<(), SceneError> {
+        let d = &self.degradation;
+        within("degradation.image_noise", d.image_noise, 0.0, 64.0)?;
+        within("degradation.depth_noise", d.depth_noise, 0.0, 0.1)?;
+        within("degradation.motion_blur", d.motion_blur, 0.0, 1.0)?;
+        within("degradation.exposure_drift", d.exposure_drift, 0.0, 2.0)?;
+        within("degradation.missing_depth", d.missing_depth, 0.0, 0.95)?;
+        within("degradation.max_range", d.max_range, 0.0, 100.0)?;
+        within("degradation.moving_speed", d.moving_speed, 0.0, 3.0)?;
+        match d.covered {
+            Some([from, to]) if from >= to || to > self.frames => Err(SceneError::Field {
+                field: "degradation.covered",
+                what: format!("is [{from}, {to}]; give [from, to] with from < to <= {} frames", self.frames),
+            }),
+            _ => Ok(()),
+        }
+    }
+}
+
+fn within(field: &'static str, value: f64, low: f64, high: f64) -> Result<(), SceneError> {
+    if (low..=high).contains(&value) {
+        Ok(())
+    } else {
+        Err(SceneError::Field { field, what: format!("is {value}; it must be between {low} and {high}") })
+    }
+}

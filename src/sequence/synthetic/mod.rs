@@ -1,0 +1,209 @@
+//! Synthetic recordings: a furnished, textured room, ray-cast along a hand-held camera's path with exact depth and poses, written
+//! in TUM's layout.
+//!
+//! [`config`] says what a scene is; [`room`] and [`furniture`] build it, [`light`] and [`surface`] bake how it looks, [`path`] moves
+//! the camera, [`render`] casts the rays, [`degrade`] is the sensor. It leaves out: mirrors and glass, deforming things, rolling
+//! shutter, and shadows of the moving object.
+
+mod bvh;
+mod config;
+mod degrade;
+mod furniture;
+mod light;
+mod noise;
+mod path;
+mod render;
+mod room;
+mod shapes;
+mod surface;
+#[cfg(test)]
+mod tests;
+mod texture;
+mod write;
+
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use glam::{DVec2, Vec3};
+use rayon::prelude::*;
+use sha2::{Digest, Sha256};
+
+use crate::geometry::{Camera, Distortion, Pinhole, Se3, StampedPose, Trajectory};
+
+pub use config::{CameraConfig, DegradationConfig, FurnitureConfig, PathConfig, PathKind, RoomConfig, SceneConfig};
+
+use path::CameraPath;
+use render::{Moment, Rendered, Renderer};
+use shapes::Primitive;
+
+/// Part of [`SceneConfig::digest`]; raise it when the same scene would render differently.
+const RENDERER_VERSION: u32 = 1;
+/// Moments averaged over an exposure. Nine, so that each also takes its own place in a 3 x 3 grid of the pixel.
+const BLUR_MOMENTS: usize = 9;
+/// Poses of the path that furnishing looks at.
+const PATH_SAMPLES: usize = 160;
+
+#[derive(Debug, thiserror::Error)]
+pub enum SceneError {
+    #[error("cannot read {path}: {source}")]
+    Read { path: PathBuf, source: std::io::Error },
+    #[error("{path}: {source}")]
+    Syntax { path: PathBuf, source: Box<toml::de::Error> },
+    #[error("{path}: {source}")]
+    In { path: PathBuf, source: Box<SceneError> },
+    #[error("`{field}` {what}")]
+    Field { field: &'static str, what: String },
+    #[error(
+        "`frames` is {frames}, too few for {rounds} rounds at the allowed pace; give at least {needed}, or raise `path.speed` and `path.turn_rate`"
+    )]
+    TooFewFrames { rounds: u32, frames: usize, needed: usize },
+    #[error("`{field}`: there is no place for number {index}; ask for fewer pieces, a larger `room`, or another `seed`")]
+    NoPlace { field: &'static str, index: usize },
+    #[error(
+        "frame {frame} would be {distance_metres:.2} m from a surface, nearer than {limit} m; enlarge the `room` or lower `path.shake_metres`",
+        limit = room::MIN_CLEARANCE
+    )]
+    TooClose { frame: usize, distance_metres: f64 },
+    #[error("{path} is there already; remove it or write elsewhere")]
+    Exists { path: PathBuf },
+    #[error("cannot write {path}: {source}; check that the folder may be written and has space")]
+    Write { path: PathBuf, source: std::io::Error },
+    #[error("cannot encode {path}: {source}")]
+    Image { path: PathBuf, source: image::ImageError },
+}
+
+impl SceneConfig {
+    /// Reads and checks a scene file.
+    pub fn read(path: &Path) -> Result<Self, SceneError> {
+        let text = std::fs::read_to_string(path).map_err(|source| SceneError::Read { path: path.into(), source })?;
+        let config: Self =
+            toml::from_str(&text).map_err(|source| SceneError::Syntax { path: path.into(), source: Box::new(source) })?;
+        config.validate().map_err(|source| SceneError::In { path: path.into(), source: Box::new(source) })?;
+        Ok(config)
+    }
+
+    /// The scene as a file, every field spelt out.
+    pub fn to_toml(&self) -> String {
+        toml::to_string(self).expect("a scene of numbers and names can be written")
+    }
+
+    /// Names what would be rendered: equal for scenes that give the same bytes. 64 hexadecimal digits.
+    pub fn digest(&self) -> String {
+        let mut hasher = Sha256::new();
+        hasher.update(RENDERER_VERSION.to_le_bytes());
+        hasher.update(self.to_toml());
+        hasher.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
+    }
+
+    fn camera(&self) -> Camera {
+        let c = &self.camera;
+        Camera {
+            pinhole: Pinhole { fx: c.fx, fy: c.fy, cx: c.cx, cy: c.cy, width: c.width, height: c.height },
+            distortion: Distortion { k1: c.k1, k2: c.k2, p1: c.p1, p2: c.p2, k3: 0.0 },
+            depth_units_per_metre: degrade::DEPTH_UNITS_PER_METRE,
+        }
+    }
+}
+
+/// A scene that is built and ready to be rendered frame by frame.
+struct Recording<'a> {
+    config: &'a SceneConfig,
+    path: CameraPath,
+    renderer: Renderer,
+}
+
+impl<'a> Recording<'a> {
+    fn new(config: &'a SceneConfig) -> Result<Self, SceneError> {
+        config.validate()?;
+        let camera = config.camera();
+        check_lens(&camera)?;
+        let path = CameraPath::new(config)?;
+        let every = config.frames.div_ceil(PATH_SAMPLES);
+        let timed = |frame: usize| (frame as f64 / config.fps, path.world_from_camera(frame as f64 / config.fps));
+        let sampled: Vec<(f64, Se3)> = (0..config.frames).step_by(every).map(timed).collect();
+        let poses: Vec<Se3> = sampled.iter().map(|(_, pose)| *pose).collect();
+        let solids = room::furnish(config, &poses)?;
+        check_clearance(config, &path, &solids)?;
+        let mover = config.degradation.moving_object.then(|| room::Mover::new(config, &sampled, &solids)).transpose()?;
+        let renderer = Renderer::new(&camera, solids, mover, config.room.gloss);
+        let moment = |(time_s, pose): &(f64, Se3)| Moment { world_from_camera: *pose, time_s: *time_s, subpixel: DVec2::ZERO };
+        renderer.warm_up(&sampled.iter().step_by(8).map(moment).collect::<Vec<_>>());
+        Ok(Self { config, path, renderer })
+    }
+
+    fn time_s(&self, frame: usize) -> f64 {
+        frame as f64 / self.config.fps
+    }
+
+    fn render(&self, frame: usize) -> Rendered {
+        let middle_s = self.time_s(frame);
+        let moment =
+            |time_s: f64, subpixel: DVec2| Moment { world_from_camera: self.path.world_from_camera(time_s), time_s, subpixel };
+        let exposure_s = self.config.degradation.motion_blur / self.config.fps;
+        if exposure_s == 0.0 {
+            return self.renderer.render(&moment(middle_s, DVec2::ZERO), true);
+        }
+        let mut sharp = self.renderer.render(&moment(middle_s, DVec2::ZERO), false);
+        for k in (0..BLUR_MOMENTS).filter(|k| *k != BLUR_MOMENTS / 2) {
+            let share = (k as f64 + 0.5) / BLUR_MOMENTS as f64 - 0.5;
+            // Places of the 3 x 3 grid in an order that does not follow time.
+            let place = (k * 2 + 5) % BLUR_MOMENTS;
+            let subpixel = DVec2::new((place % 3) as f64 - 1.0, (place / 3) as f64 - 1.0) / 3.0;
+            let other = self.renderer.render(&moment(middle_s + share * exposure_s, subpixel), false);
+            sharp.color.iter_mut().zip(other.color).for_each(|(sum, c)| *sum += c);
+        }
+        sharp.color.iter_mut().for_each(|c: &mut Vec3| *c /= BLUR_MOMENTS as f32);
+        sharp
+    }
+
+    fn trajectory(&self) -> Trajectory {
+        let pose = |frame: usize| {
+            let timestamp_s = self.time_s(frame);
+            StampedPose { timestamp_s, world_from_camera: self.path.world_from_camera(timestamp_s) }
+        };
+        Trajectory { poses: (0..self.config.frames).map(pose).collect() }
+    }
+}
+
+/// Renders `config` into the new folder `out`, in parallel; `progress` is called after each frame. The same scene gives the same
+/// bytes, however many threads there are. A run that fails or is killed leaves no folder `out`.
+pub fn generate(config: &SceneConfig, out: &Path, progress: &(dyn Fn(usize, usize) + Sync)) -> Result<(), SceneError> {
+    config.validate()?;
+    let writer = write::Writer::new(out)?;
+    let recording = Recording::new(config)?;
+    let sensor = degrade::Sensor::new(config);
+    let done = AtomicUsize::new(0);
+    (0..config.frames).into_par_iter().with_max_len(1).try_for_each(|frame| {
+        writer.frame(config, frame, &sensor.record(&recording.render(frame), frame))?;
+        progress(done.fetch_add(1, Ordering::Relaxed) + 1, config.frames);
+        Ok(())
+    })?;
+    writer.finish(config, &recording.trajectory())
+}
+
+/// A lens that folds the image over itself cannot be rendered: every recorded pixel needs the one ray that it shows.
+fn check_lens(camera: &Camera) -> Result<(), SceneError> {
+    let p = camera.pinhole;
+    let (right, bottom) = (f64::from(p.width) - 1.0, f64::from(p.height) - 1.0);
+    let along = |n: f64| (0..=16).map(move |k| n * f64::from(k) / 16.0);
+    for (x, y) in along(right).flat_map(|x| [(x, 0.0), (x, bottom)]).chain(along(bottom).flat_map(|y| [(0.0, y), (right, y)])) {
+        let recorded = nalgebra::Vector2::new(x, y);
+        let back = camera.distort_pixel(&camera.undistort_pixel(&recorded));
+        if !((back - recorded).norm() < 1e-3) {
+            let what = "are too strong: at the image's border the lens shows no single ray; use smaller coefficients".into();
+            return Err(SceneError::Field { field: "camera.k1, k2, p1, p2", what });
+        }
+    }
+    Ok(())
+}
+
+fn check_clearance(config: &SceneConfig, path: &CameraPath, solids: &[Primitive]) -> Result<(), SceneError> {
+    for frame in 0..config.frames {
+        let p = room::position(&path.world_from_camera(frame as f64 / config.fps));
+        let distance_metres = solids.iter().map(|solid| solid.distance(p)).fold(f64::INFINITY, f64::min);
+        if distance_metres < room::MIN_CLEARANCE {
+            return Err(SceneError::TooClose { frame, distance_metres });
+        }
+    }
+    Ok(())
+}
