@@ -1,1 +1,7 @@
-fn main() {}
+//! The `keysplat` command.
+
+mod cli;
+
+fn main() -> miette::Result<()> {
+    cli::main()
+}

@@ -22,7 +22,12 @@ pub struct Metrics {
     pub frames: u64,
     pub frames_read_failed: u64,
     pub frames_tracked: u64,
-    pub keyframes: u64,
+    /// Paced replay: frames that came while the tracker was busy, and keyframes that the mapper never got.
+    #[serde(default)]
+    pub frames_late: u64,
+    #[serde(default)]
+    pub keyframes_deferred: u64,
+    pub keyframes: Option<u64>,
     pub ate_rmse_m: AteFigures,
     pub rpe: RpeFigures,
     pub images: ImageProtocols,
@@ -30,7 +35,8 @@ pub struct Metrics {
     pub map_bytes: Option<u64>,
     /// SHA-256 of the exported map's bytes.
     pub map_hash: Option<String>,
-    pub wall_s: f64,
+    /// From the first frame's reading to the finished map, without the evaluation.
+    pub wall_s: Option<f64>,
     pub tracking_ms: Option<Times>,
     pub mapping: Option<MappingFigures>,
     pub peak_host_bytes: Option<u64>,
@@ -40,7 +46,7 @@ pub struct Metrics {
     pub threads: u64,
     pub version: String,
     /// SHA-256 of the resolved configuration's text.
-    pub config_hash: String,
+    pub config_hash: Option<String>,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -222,7 +228,9 @@ impl fmt::Display for Metrics {
         let sensor = format!("{:?}", self.sensor).to_lowercase();
         let lost_percent = 100.0 * self.frames.saturating_sub(self.frames_tracked) as f64 / self.frames.max(1) as f64;
         row("sequence", format!("{} ({sensor}, {})", self.sequence, if self.paced { "paced" } else { "unpaced" }))?;
-        row("frames", format!("{}, {} keyframes, {} unreadable", self.frames, self.keyframes, self.frames_read_failed))?;
+        let keyframes = self.keyframes.map_or_else(|| "–".into(), |n| n.to_string());
+        let late = if self.paced { format!(", {} late", self.frames_late) } else { String::new() };
+        row("frames", format!("{}, {keyframes} keyframes, {} unreadable{late}", self.frames, self.frames_read_failed))?;
         row("ATE RMSE", format!("{}   lost frames {lost_percent:.1} %", centimetres(self.ate_rmse_m.all_frames)))?;
         row("ATE RMSE, keyframes", centimetres(self.ate_rmse_m.keyframes))?;
         let degrees = cell(self.rpe.rot_deg_per_frame, 3, "°");
@@ -237,14 +245,14 @@ impl fmt::Display for Metrics {
         let gaussians = self.gaussians.map_or_else(|| "–".into(), |n| n.to_string());
         row("Gaussians", format!("{gaussians}   map on disk {}", mebibytes(self.map_bytes)))?;
         row("map hash", self.map_hash.clone().unwrap_or_else(|| "–".into()))?;
-        row("whole run", format!("{:.1} s", self.wall_s))?;
+        row("whole run", cell(self.wall_s, 1, "s"))?;
         let tracking = self.tracking_ms.map(|t| format!("median {:.1} ms   p95 {:.1} ms   max {:.1} ms", t.median, t.p95, t.max));
         row("tracking per frame", tracking.unwrap_or_else(|| "–".into()))?;
         row("mapping", self.mapping.map_or_else(|| "–".into(), |mapping| mapping.to_string()))?;
         row("peak memory", format!("host {}   GPU {}", mebibytes(self.peak_host_bytes), mebibytes(self.peak_gpu_bytes)))?;
         row("adapter", self.adapter.as_ref().map_or_else(|| "–".into(), Adapter::to_string))?;
         row("CPU", format!("{}   {} threads", self.cpu.as_deref().unwrap_or("–"), self.threads))?;
-        row("keysplat", format!("{}   configuration {}", self.version, self.config_hash))
+        row("keysplat", format!("{}   configuration {}", self.version, self.config_hash.as_deref().unwrap_or("–")))
     }
 }
 

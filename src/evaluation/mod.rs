@@ -6,6 +6,7 @@ pub mod image;
 pub mod machine;
 pub mod metrics;
 pub mod trajectory;
+pub mod views;
 
 pub use image::{ImageError, ImageF32, depth_l1, psnr, psnr_where_lit, ssim};
 pub use metrics::{Metrics, Times, sha256_hex, write_json};

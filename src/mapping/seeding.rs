@@ -52,13 +52,8 @@ pub(super) fn seed(
 
 /// Whether the map lacks what the pixel shows.
 fn lacks(rendered: &Rendered, pixel: usize, measured: Option<f32>, config: &SeedingConfig) -> bool {
-    if 1.0 - rendered.transmittance[pixel] < config.min_alpha {
-        return true;
-    }
-    match (rendered.depth(pixel), measured) {
-        (Some(map), Some(measured)) => map - measured > config.depth_disagreement * measured,
-        _ => false,
-    }
+    let nearer = |m: f32| rendered.expected_depth(pixel) - m > config.depth_disagreement * m;
+    rendered.alpha(pixel) < config.min_alpha || measured.is_some_and(nearer)
 }
 
 fn gaussian(keyframe: &Keyframe, (x, y): (u32, u32), metres: f32, stride: u32, config: &SeedingConfig) -> Gaussian {

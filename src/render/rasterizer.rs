@@ -29,10 +29,14 @@ pub struct Rendered {
 }
 
 impl Rendered {
-    /// Expected depth at pixel `i`, metres; `None` where hardly anything was blended.
-    pub fn depth(&self, i: usize) -> Option<f32> {
-        let alpha = 1.0 - self.transmittance[i];
-        (alpha > 0.5).then(|| self.color_depth[i][3] / alpha)
+    /// Share of the pixel `i` that the map covers.
+    pub fn alpha(&self, i: usize) -> f32 {
+        1.0 - self.transmittance[i]
+    }
+
+    /// Expected depth of what was blended at pixel `i`, metres; 0 where nothing was.
+    pub fn expected_depth(&self, i: usize) -> f32 {
+        if self.alpha(i) > 0.0 { self.color_depth[i][3] / self.alpha(i) } else { 0.0 }
     }
 }
 

@@ -2,6 +2,8 @@
 
 pub mod sh;
 
+use std::sync::Arc;
+
 use glam::{Quat, Vec3};
 
 pub use sh::ShDegree;
@@ -80,6 +82,16 @@ impl GaussianCloud {
             !finite
         })
     }
+}
+
+/// The map at one moment, as everyone but the mapper sees it.
+#[derive(Clone, Debug)]
+pub struct MapSnapshot {
+    pub cloud: Arc<GaussianCloud>,
+    /// Keyframes mapped so far.
+    pub keyframes: usize,
+    /// Mean PSNR of the views that the last keyframe's steps rendered.
+    pub psnr_db: f32,
 }
 
 /// `logit`, the inverse of the sigmoid.

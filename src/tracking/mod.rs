@@ -27,7 +27,7 @@ pub use config::TrackingConfig;
 pub use error::TrackingError;
 pub use tracker::Tracker;
 
-use crate::geometry::Se3;
+use crate::geometry::{Se3, StampedPose};
 
 /// Whether a frame has a pose.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -70,6 +70,12 @@ pub struct KeyframePose {
     pub frame_index: usize,
     pub timestamp_s: f64,
     pub world_from_camera: Se3,
+}
+
+impl KeyframePose {
+    pub fn stamped(&self) -> StampedPose {
+        StampedPose { timestamp_s: self.timestamp_s, world_from_camera: self.world_from_camera }
+    }
 }
 
 /// Wall-clock time of each stage, milliseconds; 0 where it did not run.

@@ -1,0 +1,54 @@
+//! `keysplat demo`: the synthetic room, rendered on first use, then mapped.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
+use clap::Args;
+use keysplat::config::{Config, SequenceConfig};
+use keysplat::sequence::synthetic::SceneConfig;
+use miette::IntoDiagnostic;
+
+use super::{Verbosity, generate, progress, run};
+
+const SCENE: &str = include_str!("../../sequences/demo.toml");
+/// The demo maps at half of its recorded size, which two cores without a GPU can do in a few minutes.
+const MAP_SCALE: f64 = 0.5;
+/// Says in the recording's folder which scene was rendered.
+const DIGEST_FILE: &str = "digest.txt";
+
+#[derive(Args)]
+pub struct DemoArgs {
+    /// Folder for the results; the recording is kept in `<out>/recording`.
+    #[arg(short, long, default_value = "out/demo")]
+    out: PathBuf,
+}
+
+pub fn demo(args: &DemoArgs, verbosity: Verbosity) -> miette::Result<()> {
+    let scene: SceneConfig = toml::from_str(SCENE).into_diagnostic()?;
+    let recording = args.out.join("recording");
+    if !is_current(&recording, &scene) {
+        if recording.exists() {
+            std::fs::remove_dir_all(&recording).into_diagnostic()?;
+        }
+        generate::render(&scene, &recording, verbosity)?;
+        std::fs::write(recording.join(DIGEST_FILE), scene.digest()).into_diagnostic()?;
+    }
+    let sequence = Some(SequenceConfig { path: recording, layout: None, camera: None });
+    let config = Config { sequence, map_scale: MAP_SCALE, ..Config::default() };
+    let stop = Arc::new(AtomicBool::new(false));
+    progress::stop_on_ctrl_c(&stop)?;
+    run::replay(&config, args.out.clone(), stop, verbosity)?;
+    if verbosity.shows_progress() {
+        println!(
+            "\nThe map is {}; open it in any viewer of Gaussian splats, SuperSplat for one.",
+            args.out.join("map.ply").display()
+        );
+        println!("Held-out views beside their renders are in {}.", args.out.join("views").display());
+    }
+    Ok(())
+}
+
+fn is_current(recording: &Path, scene: &SceneConfig) -> bool {
+    std::fs::read_to_string(recording.join(DIGEST_FILE)).is_ok_and(|digest| digest == scene.digest())
+}

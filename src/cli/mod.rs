@@ -1,0 +1,104 @@
+//! The command line: one file per subcommand.
+
+mod adapters;
+mod demo;
+mod eval;
+mod generate;
+mod progress;
+mod run;
+
+use clap::{Parser, Subcommand, ValueEnum};
+use miette::IntoDiagnostic;
+use tracing_subscriber::EnvFilter;
+
+/// Replays recorded image sequences into a camera trajectory and a photorealistic Gaussian map.
+#[derive(Parser)]
+#[command(version, max_term_width = 110)]
+struct Cli {
+    /// Say nothing but errors.
+    #[arg(short, long, global = true)]
+    quiet: bool,
+    /// How to log on standard error. `RUST_LOG` chooses what.
+    #[arg(long, global = true, value_enum, default_value_t = LogFormat::Text)]
+    log: LogFormat,
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum LogFormat {
+    /// Lines for people, and a progress bar.
+    Text,
+    /// One JSON object a line, and no progress bar.
+    Json,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Replay a recording into a trajectory and a map.
+    Run(run::RunArgs),
+    /// Render the demo's synthetic room and map it.
+    Demo(demo::DemoArgs),
+    /// Render a synthetic scene as a recording.
+    Generate(generate::GenerateArgs),
+    /// Measure a finished run, of ours or anybody's.
+    Eval(eval::EvalArgs),
+    /// List the adapters that the mapper could use.
+    Adapters,
+}
+
+/// How much to say, and how.
+#[derive(Clone, Copy)]
+struct Verbosity {
+    quiet: bool,
+    json: bool,
+}
+
+impl Verbosity {
+    fn shows_progress(self) -> bool {
+        !self.quiet && !self.json
+    }
+}
+
+pub fn main() -> miette::Result<()> {
+    let cli = Cli::parse();
+    let verbosity = Verbosity { quiet: cli.quiet, json: cli.log == LogFormat::Json };
+    start_log(verbosity)?;
+    match cli.command {
+        Command::Run(args) => run::run(args, verbosity),
+        Command::Demo(args) => demo::demo(&args, verbosity),
+        Command::Generate(args) => generate::generate(&args, verbosity),
+        Command::Eval(args) => eval::eval(&args, verbosity),
+        Command::Adapters => {
+            adapters::adapters();
+            Ok(())
+        }
+    }
+}
+
+fn start_log(verbosity: Verbosity) -> miette::Result<()> {
+    let level = if verbosity.quiet { "error" } else { "keysplat=info,warn" };
+    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(level));
+    let log = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).with_target(false);
+    if verbosity.json { log.json().try_init() } else { log.without_time().try_init() }.map_err(|e| miette::miette!("{e}"))?;
+    // A panic of a worker thread is reported once, where it is joined.
+    let default_hook = std::panic::take_hook();
+    std::panic::set_hook(Box::new(move |info| {
+        if std::thread::current().name() == Some("main") {
+            default_hook(info);
+        } else {
+            tracing::error!("{info}");
+        }
+    }));
+    Ok(())
+}
+
+/// Prints figures on standard output, in the form that was asked for.
+fn print_metrics(metrics: &keysplat::evaluation::Metrics, verbosity: Verbosity) -> miette::Result<()> {
+    if verbosity.json {
+        println!("{}", serde_json::to_string(metrics).into_diagnostic()?);
+    } else if !verbosity.quiet {
+        print!("{metrics}");
+    }
+    Ok(())
+}

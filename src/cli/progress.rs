@@ -1,0 +1,30 @@
+//! Progress bars on standard error, and Ctrl-C.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use indicatif::{ProgressBar, ProgressStyle};
+use miette::IntoDiagnostic;
+
+use super::Verbosity;
+
+/// A bar in the given template; hidden where nothing should be shown.
+pub fn bar(verbosity: Verbosity, len: u64, template: &str) -> ProgressBar {
+    if !verbosity.shows_progress() {
+        return ProgressBar::hidden();
+    }
+    let style = ProgressStyle::with_template(template).expect("our templates are valid");
+    ProgressBar::new(len).with_style(style)
+}
+
+/// The first Ctrl-C asks the run to finish with what there is, the second ends the program.
+pub fn stop_on_ctrl_c(stop: &Arc<AtomicBool>) -> miette::Result<()> {
+    let stop = stop.clone();
+    ctrlc::set_handler(move || {
+        if stop.swap(true, Ordering::Relaxed) {
+            std::process::exit(130);
+        }
+        eprintln!("finishing with what there is; press Ctrl-C again to quit at once");
+    })
+    .into_diagnostic()
+}

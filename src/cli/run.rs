@@ -1,0 +1,180 @@
+//! `keysplat run`
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use clap::Args;
+use indicatif::ProgressBar;
+use keysplat::config::{Config, SequenceConfig};
+use keysplat::gpu::Gpu;
+use keysplat::pipeline::{self, Outcome, Progress, outputs};
+use keysplat::sequence::{Layout, Sequence};
+use miette::{IntoDiagnostic, WrapErr, miette};
+
+use super::{Verbosity, print_metrics, progress};
+
+#[derive(Args)]
+pub struct RunArgs {
+    /// Folder of the recording; may also stand in the configuration.
+    sequence: Option<PathBuf>,
+    /// Folder for the results.
+    #[arg(short, long)]
+    out: PathBuf,
+    /// Configuration (TOML); options on the command line go before it.
+    #[arg(short, long)]
+    config: Option<PathBuf>,
+    /// Layout of the recording, where it isn't recognised.
+    #[arg(long, value_enum)]
+    layout: Option<Layout>,
+    /// Camera preset to use instead of the recording's own calibration.
+    #[arg(long)]
+    camera: Option<String>,
+    /// Mapping resolution as a share of the recorded one, e.g. 0.5.
+    #[arg(long)]
+    map_scale: Option<f64>,
+    /// Replay every n-th frame.
+    #[arg(long)]
+    every: Option<usize>,
+    /// Replay frames A..B only (B excluded; either may be left out).
+    #[arg(long, value_name = "A..B", value_parser = parse_range)]
+    frames: Option<(usize, usize)>,
+    /// Let frames arrive by their timestamps and drop what comes too late.
+    #[arg(long)]
+    paced: bool,
+    /// Part of the name of the adapter to use (see `keysplat adapters`).
+    #[arg(long)]
+    adapter: Option<String>,
+}
+
+fn parse_range(text: &str) -> Result<(usize, usize), String> {
+    let wrong = || format!("`{text}` is no range; write A..B, like 0..200, with A below B");
+    let (start, end) = text.split_once("..").ok_or_else(wrong)?;
+    let number = |part: &str, default| if part.is_empty() { Ok(default) } else { part.parse().map_err(|_| wrong()) };
+    let (start, end) = (number(start, 0)?, number(end, usize::MAX)?);
+    if start < end { Ok((start, end)) } else { Err(wrong()) }
+}
+
+impl RunArgs {
+    fn resolve(&self) -> miette::Result<Config> {
+        let mut config = self.config.as_deref().map_or_else(|| Ok(Config::default()), Config::read).into_diagnostic()?;
+        if let Some(path) = &self.sequence {
+            config.sequence = Some(SequenceConfig { path: path.clone(), layout: None, camera: None });
+        }
+        let sequence = config
+            .sequence
+            .as_mut()
+            .ok_or_else(|| miette!("which recording? Give its folder: keysplat run <SEQUENCE> --out <DIR>"))?;
+        sequence.layout = self.layout.or(sequence.layout);
+        sequence.camera = self.camera.clone().or(sequence.camera.take());
+        config.map_scale = self.map_scale.unwrap_or(config.map_scale);
+        config.replay.every = self.every.unwrap_or(config.replay.every);
+        config.replay.frames = self.frames.or(config.replay.frames);
+        config.replay.paced |= self.paced;
+        config.adapter = self.adapter.clone().or(config.adapter);
+        config.validate().into_diagnostic()?;
+        Ok(config)
+    }
+}
+
+pub fn run(args: RunArgs, verbosity: Verbosity) -> miette::Result<()> {
+    let config = args.resolve()?;
+    let stop = Arc::new(AtomicBool::new(false));
+    progress::stop_on_ctrl_c(&stop)?;
+    replay(&config, args.out, stop, verbosity)
+}
+
+/// Opens the recording that a configuration names, with its selection of frames.
+pub fn open(config: &Config) -> miette::Result<Sequence> {
+    let named = config.sequence.as_ref().ok_or_else(|| miette!("the configuration names no recording"))?;
+    let mut sequence = Sequence::open(&named.path, named.layout, named.camera.as_deref()).into_diagnostic()?;
+    let range = config.replay.frames.map(|(start, end)| start..end);
+    sequence.select(range, config.replay.every).into_diagnostic()?;
+    Ok(sequence)
+}
+
+/// Replays, writes everything, measures, prints. What was made is written before an error is reported.
+pub fn replay(config: &Config, out: PathBuf, stop: Arc<AtomicBool>, verbosity: Verbosity) -> miette::Result<()> {
+    let sequence = open(config)?;
+    outputs::prepare_folder(&out).into_diagnostic()?;
+    let gpu = Gpu::open(config.adapter.as_deref()).into_diagnostic()?;
+    tracing::info!(
+        sequence = sequence.name,
+        frames = sequence.entries.len(),
+        adapter = gpu.adapter.name,
+        "replaying into {}",
+        out.display()
+    );
+    let windows = Progress { stop, ..Progress::default() };
+    let mut outcome = std::thread::scope(|scope| {
+        let done = AtomicBool::new(false);
+        let (windows, done) = (&windows, &done);
+        let bar = progress::bar(verbosity, sequence.entries.len() as u64, "{wide_bar} {pos}/{len} frames  {msg}");
+        scope.spawn(move || show(windows, &bar, done));
+        let outcome = pipeline::run(&sequence, &gpu, config, windows);
+        done.store(true, Ordering::Relaxed);
+        outcome
+    })
+    .into_diagnostic()?;
+    let error = outcome.error.take();
+    let map = outputs::write_results(&out, &outcome, config).into_diagnostic()?;
+    if !outcome.poses.is_empty() {
+        let bar = progress::bar(verbosity, outcome.poses.len() as u64, "{wide_bar} {pos}/{len} views compared");
+        let measured =
+            outputs::measure((&sequence, config), &gpu, &subject(&outcome), &out, &|done| bar.set_position(done as u64));
+        bar.finish_and_clear();
+        let measured = measured.into_diagnostic()?;
+        let metrics = outputs::write_metrics((&sequence, config), &gpu, &outcome, (measured, map), &out).into_diagnostic()?;
+        print_metrics(&metrics, verbosity)?;
+    }
+    match error {
+        None => Ok(()),
+        Some(error) => {
+            Err(error).into_diagnostic().wrap_err_with(|| format!("the run ended early; what there was is in {}", out.display()))
+        }
+    }
+}
+
+fn subject(outcome: &Outcome) -> outputs::Subject<'_> {
+    outputs::Subject {
+        trajectory: &outcome.trajectory,
+        poses: outcome.poses.iter().map(|(index, pose)| (*index, pose.world_from_camera)).collect(),
+        keyframes: outcome.keyframe_trajectory(),
+        keyframe_indices: outcome.keyframes.iter().map(|k| k.frame_index).collect(),
+        cloud: &outcome.cloud,
+    }
+}
+
+/// Keeps the bar up to date until the run is done.
+fn show(windows: &Progress, bar: &ProgressBar, done: &AtomicBool) {
+    let started = Instant::now();
+    let (mut keyframes, mut lost, mut mapped) = (0, "", String::new());
+    while !done.load(Ordering::Relaxed) {
+        if let Some(tracking) = windows.tracking.pop() {
+            bar.set_position(tracking.frames_done as u64);
+            keyframes = tracking.keyframes;
+            lost = if tracking.lost { "  LOST" } else { "" };
+        }
+        if let Some(map) = windows.mapping.pop() {
+            mapped = format!(", {} mapped, {} Gaussians, {:.1} dB", map.keyframes, map.cloud.len(), map.psnr_db);
+        }
+        let rate = bar.position() as f64 / started.elapsed().as_secs_f64().max(1e-3);
+        bar.set_message(format!("{rate:.1}/s  {keyframes} keyframes{mapped}{lost}"));
+        std::thread::sleep(Duration::from_millis(100));
+    }
+    bar.finish_and_clear();
+}
+
+#[cfg(test)]
+mod tests {
+    use super::parse_range;
+
+    #[test]
+    fn ranges_may_be_open() {
+        assert_eq!(parse_range("3..9"), Ok((3, 9)));
+        assert_eq!(parse_range("..9"), Ok((0, 9)));
+        assert_eq!(parse_range("3.."), Ok((3, usize::MAX)));
+        assert!(["9..3", "3", "a..b", "3..3"].iter().all(|text| parse_range(text).is_err()));
+    }
+}

@@ -1,0 +1,158 @@
+//! The configuration of a run: the modules' own configs, composed and validated once.
+
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+
+use crate::mapping::MappingConfig;
+use crate::sequence::Layout;
+use crate::tracking::TrackingConfig;
+
+/// Everything that a run can be told. Written resolved beside its outputs, where it is a valid configuration again.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Config {
+    /// The recording; on the command line, usually.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub sequence: Option<SequenceConfig>,
+    /// Part of an adapter's name; the fastest adapter where absent.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub adapter: Option<String>,
+    /// Mapping resolution as a share of the recorded one.
+    pub map_scale: f64,
+    pub replay: ReplayConfig,
+    pub tracking: TrackingConfig,
+    pub mapping: MappingConfig,
+}
+
+/// Where a recording lies and how to read it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SequenceConfig {
+    pub path: PathBuf,
+    /// Recognised where absent.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub layout: Option<Layout>,
+    /// A camera preset instead of what the recording says.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub camera: Option<String>,
+}
+
+/// Which frames are replayed, and how fast.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ReplayConfig {
+    /// Every n-th frame.
+    pub every: usize,
+    /// First frame and the one past the last, before `every`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub frames: Option<(usize, usize)>,
+    /// Frames arrive by their timestamps; what comes too late is counted. Otherwise nothing is dropped and a run repeats to the bit.
+    pub paced: bool,
+    /// Every n-th frame is never given to the mapper and measures the map; 0 holds none out.
+    pub held_out_every: usize,
+}
+
+impl Default for Config {
+    fn default() -> Self {
+        Self {
+            sequence: None,
+            adapter: None,
+            map_scale: 1.0,
+            replay: ReplayConfig::default(),
+            tracking: TrackingConfig::default(),
+            mapping: MappingConfig::default(),
+        }
+    }
+}
+
+impl Default for ReplayConfig {
+    fn default() -> Self {
+        Self { every: 1, frames: None, paced: false, held_out_every: 8 }
+    }
+}
+
+impl ReplayConfig {
+    /// Whether frame `index` of the replay is kept from the mapper: the last of each group, so that the first frame is not.
+    pub fn is_held_out(&self, index: usize) -> bool {
+        self.held_out_every > 0 && index % self.held_out_every == self.held_out_every - 1
+    }
+}
+
+#[derive(Debug, thiserror::Error)]
+pub enum ConfigError {
+    #[error("cannot read the configuration {path}: {source}")]
+    Read { path: PathBuf, source: std::io::Error },
+    #[error("{path}: {source}")]
+    Syntax { path: PathBuf, source: Box<toml::de::Error> },
+    #[error("{0}")]
+    Value(String),
+}
+
+impl Config {
+    /// Reads a TOML file; keys that it leaves out keep their defaults, unknown ones are errors.
+    pub fn read(path: &Path) -> Result<Self, ConfigError> {
+        let text = std::fs::read_to_string(path).map_err(|source| ConfigError::Read { path: path.into(), source })?;
+        toml::from_str(&text).map_err(|source| ConfigError::Syntax { path: path.into(), source: Box::new(source) })
+    }
+
+    /// Checks all values.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        let value = |message: String| Err(ConfigError::Value(message));
+        if !(self.map_scale > 0.0 && self.map_scale <= 1.0) {
+            return value(format!("map_scale must be above 0 and at most 1, not {}", self.map_scale));
+        }
+        if self.replay.every == 0 {
+            return value("replay.every must be at least 1".into());
+        }
+        if self.replay.held_out_every == 1 {
+            return value("replay.held_out_every = 1 would keep every frame from the mapper; use 0 to hold none out".into());
+        }
+        self.tracking.validate().map_err(|e| ConfigError::Value(format!("tracking: {e}")))?;
+        self.mapping.validate().map_err(ConfigError::Value)
+    }
+
+    /// The resolved configuration as TOML.
+    pub fn to_toml(&self) -> String {
+        toml::to_string(self).expect("a configuration is plain data")
+    }
+
+    /// The resolved configuration without the place of the recording: equal for runs that should give equal results.
+    pub fn identity(&self) -> String {
+        Self { sequence: None, ..self.clone() }.to_toml()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_resolved_configuration_reads_back_the_same() {
+        let mut config = Config { adapter: Some("llvmpipe".into()), ..Config::default() };
+        config.sequence = Some(SequenceConfig { path: "kitchen".into(), layout: Some(Layout::Tum), camera: None });
+        config.replay.frames = Some((3, 9));
+        assert_eq!(toml::from_str::<Config>(&config.to_toml()).unwrap(), config);
+    }
+
+    #[test]
+    fn unknown_keys_and_wrong_values_are_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("run.toml");
+        std::fs::write(&path, "map_scale = 0.5\n[mapping.loss]\nssim_wieght = 0.1\n").unwrap();
+        let message = Config::read(&path).unwrap_err().to_string();
+        assert!(message.contains("run.toml") && message.contains("line 3") && message.contains("ssim_wieght"), "{message}");
+        let wrong = |text: &str| toml::from_str::<Config>(text).unwrap().validate().unwrap_err().to_string();
+        assert!(wrong("map_scale = 2.0").contains("map_scale"));
+        assert!(wrong("[mapping.seeding]\nstride = 0").contains("stride"));
+        assert!(wrong("[mapping.adam]\nbeta_1 = 1.0").contains("beta_1"));
+    }
+
+    #[test]
+    fn the_first_frame_is_never_held_out() {
+        let replay = ReplayConfig::default();
+        let held: Vec<usize> = (0..24).filter(|i| replay.is_held_out(*i)).collect();
+        assert_eq!(held, [7, 15, 23]);
+        assert!(!(0..24).any(|i| ReplayConfig { held_out_every: 0, ..ReplayConfig::default() }.is_held_out(i)));
+    }
+}

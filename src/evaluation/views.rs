@@ -1,0 +1,107 @@
+//! Renders the final map at estimated poses and compares with what the camera recorded, by the three protocols in use.
+//!
+//! Images are compared at the mapping resolution, without lens distortion, with the camera's own principal point.
+
+use std::collections::BTreeSet;
+use std::sync::Arc;
+
+use image::{Rgb, RgbImage};
+use rayon::prelude::*;
+
+use super::image::{ImageF32, depth_l1, psnr, psnr_where_lit, ssim};
+use super::metrics::{ImageMeans, ImageProtocols};
+use crate::geometry::Se3;
+use crate::gpu::{Gpu, GpuError};
+use crate::render::{GpuCloud, Rasterizer, Rendered, ViewCamera};
+use crate::sequence::{RectifiedImage, Rectifier, Sequence};
+use crate::splat::GaussianCloud;
+
+/// MonoGS compares every 5th frame.
+const MONOGS_EVERY: usize = 5;
+/// Views decoded and compared side by side.
+const BATCH: usize = 8;
+
+/// Which views are compared, and how they count.
+pub struct ViewSelection<'a> {
+    /// `(frame index, world_from_camera)` of every posed frame.
+    pub poses: &'a [(usize, Se3)],
+    /// Frame indices of keyframes.
+    pub keyframes: &'a BTreeSet<usize>,
+    pub is_held_out: &'a (dyn Fn(usize) -> bool + Sync),
+}
+
+/// One held-out view beside what was recorded.
+pub struct ComparedView {
+    pub frame: usize,
+    pub recorded: RgbImage,
+    pub rendered: RgbImage,
+}
+
+struct ViewFigures {
+    psnr: f64,
+    psnr_lit: f64,
+    ssim: f64,
+    depth_l1: Option<f64>,
+}
+
+/// Compares all posed views; `on_held_out` gets each held-out one. Frames that cannot be read are left out. `progress` hears how
+/// many views are done.
+pub fn evaluate_views(
+    (sequence, map_scale): (&Sequence, f64),
+    (gpu, cloud): (&Arc<Gpu>, &GaussianCloud),
+    selection: &ViewSelection<'_>,
+    on_held_out: &mut dyn FnMut(ComparedView),
+    progress: &dyn Fn(usize),
+) -> Result<ImageProtocols, GpuError> {
+    let rectifier = Rectifier::new(&sequence.camera, map_scale);
+    let mut rasterizer = Rasterizer::new(gpu.clone())?;
+    let mut on_gpu = GpuCloud::new(gpu, cloud.sh_degree, cloud.len())?;
+    on_gpu.append(gpu, cloud)?;
+    let [mut held_out, mut all_frames, mut monogs] = [ImageMeans::default(); 3];
+    for (batch, poses) in selection.poses.chunks(BATCH).enumerate() {
+        progress(batch * BATCH);
+        let recorded: Vec<Option<RectifiedImage>> =
+            poses.par_iter().map(|(index, _)| Some(rectifier.rectify(&sequence.load(*index).ok()?))).collect();
+        let mut views = Vec::new();
+        for ((index, world_from_camera), recorded) in poses.iter().zip(recorded) {
+            let Some(recorded) = recorded else { continue };
+            let camera = ViewCamera { pinhole: recorded.pinhole, camera_from_world: world_from_camera.inverse() };
+            views.push((*index, rasterizer.render(&on_gpu, &camera, [0.0; 3])?, recorded));
+        }
+        let figures: Vec<ViewFigures> = views.par_iter().map(|(_, rendered, recorded)| compare(rendered, recorded)).collect();
+        for ((index, rendered, recorded), f) in views.into_iter().zip(figures) {
+            all_frames.add(f.psnr, f.ssim, f.depth_l1);
+            if index % MONOGS_EVERY == 0 && !selection.keyframes.contains(&index) {
+                monogs.add(f.psnr_lit, f.ssim, f.depth_l1);
+            }
+            if (selection.is_held_out)(index) {
+                held_out.add(f.psnr, f.ssim, f.depth_l1);
+                on_held_out(ComparedView { frame: index, recorded: recorded.color, rendered: to_rgb8(&rendered) });
+            }
+        }
+    }
+    Ok(ImageProtocols { held_out: held_out.figures(), all_frames: all_frames.figures(), monogs: monogs.figures() })
+}
+
+fn compare(rendered: &Rendered, recorded: &RectifiedImage) -> ViewFigures {
+    let pixels = rendered.color_depth.iter().map(|p| [p[0], p[1], p[2]]).collect();
+    let image = ImageF32::new(rendered.width as usize, rendered.height as usize, pixels).expect("one colour a pixel").clamped();
+    let truth = ImageF32::from_rgb8(&recorded.color);
+    let same_size = "both are at the mapping resolution";
+    let depth: Vec<f32> = (0..rendered.color_depth.len()).map(|i| rendered.expected_depth(i)).collect();
+    ViewFigures {
+        psnr: psnr(&image, &truth).expect(same_size),
+        psnr_lit: psnr_where_lit(&image, &truth).expect(same_size),
+        ssim: ssim(&image, &truth).expect(same_size),
+        depth_l1: recorded.depth.as_ref().and_then(|sensor| depth_l1(&depth, &sensor.metres)),
+    }
+}
+
+/// The rendered colours as an 8-bit image.
+pub fn to_rgb8(rendered: &Rendered) -> RgbImage {
+    let byte = |v: f32| (v.clamp(0.0, 1.0) * 255.0).round() as u8;
+    RgbImage::from_fn(rendered.width, rendered.height, |x, y| {
+        let p = rendered.color_depth[(y * rendered.width + x) as usize];
+        Rgb([byte(p[0]), byte(p[1]), byte(p[2])])
+    })
+}

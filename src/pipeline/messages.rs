@@ -1,0 +1,83 @@
+//! What the threads tell each other, and how they fail.
+
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use crossbeam::queue::ArrayQueue;
+
+use crate::geometry::Se3;
+use crate::mapping::{Keyframe, KeyframeId, MappingError};
+use crate::splat::MapSnapshot;
+use crate::tracking::TrackingError;
+
+#[derive(Debug, thiserror::Error)]
+pub enum PipelineError {
+    #[error(transparent)]
+    Tracking(#[from] TrackingError),
+    #[error(transparent)]
+    Mapping(#[from] MappingError),
+    #[error("the {thread} thread panicked: {message}; what was done until then is kept. Please report this")]
+    Panicked { thread: &'static str, message: String },
+    #[error("the {thread} thread could not be started: {source}")]
+    Spawn { thread: &'static str, source: std::io::Error },
+    #[error("not one of the {frames} frames could be read; the first one failed so: {first}")]
+    NothingRead { frames: usize, first: String },
+}
+
+/// Tracker → mapper. The end of the sequence is the channel's end.
+#[derive(Debug)]
+pub enum MapperMessage {
+    Keyframe(Box<Keyframe>),
+    /// Earlier keyframes that bundle adjustment moved.
+    PoseUpdate(Vec<(KeyframeId, Se3)>),
+}
+
+/// Where a run stands, for whoever shows it.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct TrackingProgress {
+    pub frames_done: usize,
+    pub keyframes: usize,
+    pub lost: bool,
+}
+
+/// The windows onto a run that a display may look through; each slot holds the newest value.
+#[derive(Clone, Debug)]
+pub struct Progress {
+    pub tracking: Arc<ArrayQueue<TrackingProgress>>,
+    pub mapping: Arc<ArrayQueue<MapSnapshot>>,
+    /// Set to end the run early: what there is will be finished and returned.
+    pub stop: Arc<AtomicBool>,
+}
+
+impl Default for Progress {
+    fn default() -> Self {
+        Self { tracking: Arc::new(ArrayQueue::new(1)), mapping: Arc::new(ArrayQueue::new(1)), stop: Arc::default() }
+    }
+}
+
+impl Progress {
+    pub(super) fn stopped(&self) -> bool {
+        self.stop.load(Ordering::Relaxed)
+    }
+}
+
+/// Runs one piece of a thread's work; a panic in it becomes an error, and the thread's results survive.
+pub(super) fn guarded<T>(thread: &'static str, work: impl FnOnce() -> Result<T, PipelineError>) -> Result<T, PipelineError> {
+    catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(|payload| {
+        let text = payload.downcast_ref::<&str>().map(ToString::to_string);
+        let message = text.or_else(|| payload.downcast_ref::<String>().cloned()).unwrap_or_else(|| "no message".into());
+        Err(PipelineError::Panicked { thread, message })
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_panic_becomes_an_error_that_names_the_thread() {
+        let error = guarded::<()>("mapping", || panic!("index {}", 7)).unwrap_err();
+        assert!(error.to_string().starts_with("the mapping thread panicked: index 7"));
+    }
+}

@@ -1,0 +1,19 @@
+//! Threads and messages: reader → tracker → mapper, with bounded channels in between and immutable snapshots out.
+//!
+//! | message | carried by | when full |
+//! |---|---|---|
+//! | reader → tracker: [`Frame`](crate::sequence::Frame) | bounded channel | unpaced: waits; paced: the frame is dropped and counted |
+//! | tracker → mapper: [`MapperMessage`] | bounded channel | unpaced: waits; paced: the newest keyframe waits, older ones are counted as deferred |
+//! | mapper → viewers: [`MapSnapshot`](crate::splat::MapSnapshot) | single-slot queue | newest wins |
+//!
+//! No lock is taken on the per-frame path. A thread that panics ends its own work; what it had is still returned.
+
+mod map_thread;
+mod messages;
+pub mod outputs;
+mod read_thread;
+mod run;
+mod track_thread;
+
+pub use messages::{MapperMessage, PipelineError, Progress};
+pub use run::{Outcome, run};

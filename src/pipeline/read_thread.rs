@@ -1,0 +1,50 @@
+//! Decodes frames ahead of the tracker and keeps the replay's clock.
+
+use std::time::{Duration, Instant};
+
+use crossbeam::channel::{Sender, TrySendError};
+
+use super::Progress;
+use crate::sequence::{Frame, Sequence};
+
+/// What reading came to.
+#[derive(Clone, Debug, Default)]
+pub(super) struct ReadSummary {
+    pub read_failed: usize,
+    pub first_failure: Option<String>,
+    /// Paced replay: frames that came while the tracker was still busy.
+    pub late: usize,
+}
+
+/// Sends every frame that can be read, in order. Paced replay waits for each frame's time and never for the tracker.
+pub(super) fn read(sequence: &Sequence, paced: bool, sender: &Sender<Frame>, progress: &Progress) -> ReadSummary {
+    let mut summary = ReadSummary::default();
+    let started = Instant::now();
+    let first_s = sequence.entries.first().map_or(0.0, |entry| entry.timestamp_s);
+    for index in 0..sequence.entries.len() {
+        if progress.stopped() {
+            break;
+        }
+        let frame = match sequence.load(index) {
+            Ok(frame) => frame,
+            Err(error) => {
+                tracing::warn!(frame = index, "skipped, it cannot be read: {error}");
+                summary.read_failed += 1;
+                summary.first_failure.get_or_insert_with(|| error.to_string());
+                continue;
+            }
+        };
+        if paced {
+            let due = Duration::try_from_secs_f64(frame.timestamp_s - first_s).unwrap_or_default();
+            std::thread::sleep(due.saturating_sub(started.elapsed()));
+            match sender.try_send(frame) {
+                Ok(()) => {}
+                Err(TrySendError::Full(_)) => summary.late += 1,
+                Err(TrySendError::Disconnected(_)) => break,
+            }
+        } else if sender.send(frame).is_err() {
+            break;
+        }
+    }
+    summary
+}

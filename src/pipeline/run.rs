@@ -1,0 +1,117 @@
+//! Starts the threads, waits for them, and gathers what they made.
+
+use std::sync::Arc;
+use std::thread::{Builder, ScopedJoinHandle};
+use std::time::Instant;
+
+use crossbeam::channel::bounded;
+
+use super::map_thread::{self, MapSummary};
+use super::messages::guarded;
+use super::read_thread::{self, ReadSummary};
+use super::track_thread::{self, TrackSummary};
+use super::{PipelineError, Progress};
+use crate::config::Config;
+use crate::geometry::{StampedPose, Trajectory};
+use crate::gpu::Gpu;
+use crate::mapping::KeyframeReport;
+use crate::sequence::Sequence;
+use crate::splat::GaussianCloud;
+use crate::tracking::KeyframePose;
+
+/// Frames decoded ahead of the tracker; paced replay keeps just the one that is due.
+const FRAMES_AHEAD: usize = 4;
+/// Keyframes and pose updates that may wait for the mapper. Few, so that the map never lags far behind the camera.
+const MESSAGES_AHEAD: usize = 4;
+
+/// Everything that a replay made, whether or not it came to its end.
+#[derive(Debug)]
+pub struct Outcome {
+    pub cloud: Arc<GaussianCloud>,
+    /// `(frame index, pose)` of every tracked frame.
+    pub poses: Vec<(usize, StampedPose)>,
+    pub trajectory: Trajectory,
+    pub keyframes: Vec<KeyframePose>,
+    pub keyframe_reports: Vec<KeyframeReport>,
+    pub frames_read_failed: usize,
+    pub frames_late: usize,
+    pub keyframes_deferred: usize,
+    pub tracking_ms: Vec<f64>,
+    pub step_ms: Vec<f64>,
+    pub wall_s: f64,
+    /// What ended the replay early.
+    pub error: Option<PipelineError>,
+}
+
+impl Outcome {
+    pub fn keyframe_trajectory(&self) -> Trajectory {
+        Trajectory { poses: self.keyframes.iter().map(KeyframePose::stamped).collect() }
+    }
+}
+
+/// Replays a sequence. Errors that end it early are in the outcome, beside what was made until then.
+pub fn run(sequence: &Sequence, gpu: &Arc<Gpu>, config: &Config, progress: &Progress) -> Result<Outcome, PipelineError> {
+    let started = Instant::now();
+    let paced = config.replay.paced;
+    let (frame_sender, frames) = bounded(if paced { 1 } else { FRAMES_AHEAD });
+    let (message_sender, messages) = bounded(MESSAGES_AHEAD);
+    let (read, track, map) = std::thread::scope(|scope| {
+        let spawn_error = |thread| move |source| PipelineError::Spawn { thread, source };
+        // A thread that cannot start drops its end of the channels, and the others end with it.
+        let map = Builder::new()
+            .name("mapping".into())
+            .spawn_scoped(scope, move || map_thread::map(gpu, &config.mapping, &messages, progress))
+            .map_err(spawn_error("mapping"))?;
+        let track = Builder::new()
+            .name("tracking".into())
+            .spawn_scoped(scope, move || track_thread::track(sequence, config, &frames, &message_sender, progress))
+            .map_err(spawn_error("tracking"))?;
+        let read = Builder::new()
+            .name("reading".into())
+            .spawn_scoped(scope, move || read_thread::read(sequence, paced, &frame_sender, progress))
+            .map_err(spawn_error("reading"))?;
+        Ok::<_, PipelineError>((join("reading", read), join("tracking", track), join("mapping", map)))
+    })?;
+    Ok(outcome(sequence, started, read, track, map))
+}
+
+fn join<T>(thread: &'static str, handle: ScopedJoinHandle<'_, T>) -> Result<T, PipelineError> {
+    guarded(thread, || Ok(handle.join().unwrap_or_else(|payload| std::panic::resume_unwind(payload))))
+}
+
+fn outcome(
+    sequence: &Sequence,
+    started: Instant,
+    read: Result<ReadSummary, PipelineError>,
+    track: Result<TrackSummary, PipelineError>,
+    map: Result<MapSummary, PipelineError>,
+) -> Outcome {
+    let mut errors = Vec::new();
+    let read = read.unwrap_or_else(|error| {
+        errors.push(error);
+        ReadSummary::default()
+    });
+    let map = map.unwrap_or_else(|error| MapSummary { error: Some(error), ..MapSummary::default() });
+    let track = track.unwrap_or_else(|error| TrackSummary { error: Some(error), ..TrackSummary::default() });
+    let frames = sequence.entries.len();
+    if let Some(first) = read.first_failure.filter(|_| read.read_failed == frames) {
+        errors.push(PipelineError::NothingRead { frames, first });
+    }
+    let trajectory = track.stamped();
+    errors.extend(track.error);
+    errors.extend(map.error);
+    Outcome {
+        cloud: map.cloud,
+        poses: track.trajectory,
+        trajectory,
+        keyframes: track.keyframes,
+        keyframe_reports: map.reports,
+        frames_read_failed: read.read_failed,
+        frames_late: read.late,
+        keyframes_deferred: track.deferred,
+        tracking_ms: track.times_ms,
+        step_ms: map.step_ms,
+        wall_s: started.elapsed().as_secs_f64(),
+        error: errors.into_iter().next(),
+    }
+}

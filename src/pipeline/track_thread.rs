@@ -1,0 +1,124 @@
+//! Tracks frames and hands keyframes on to the mapper.
+
+use crossbeam::channel::{Receiver, Sender, TrySendError};
+
+use super::messages::{TrackingProgress, guarded};
+use super::{MapperMessage, PipelineError, Progress};
+use crate::config::Config;
+use crate::geometry::{StampedPose, Trajectory};
+use crate::mapping::Keyframe;
+use crate::sequence::{Frame, Rectifier, Sequence};
+use crate::tracking::{KeyframePose, NewKeyframe, TrackedFrame, Tracker, TrackingState};
+
+/// What tracking came to, also when it ended early.
+#[derive(Debug, Default)]
+pub(super) struct TrackSummary {
+    /// `(frame index, pose)` of every tracked frame, finally corrected.
+    pub trajectory: Vec<(usize, StampedPose)>,
+    pub keyframes: Vec<KeyframePose>,
+    pub times_ms: Vec<f64>,
+    /// Paced replay: keyframes that the mapper never got.
+    pub deferred: usize,
+    pub error: Option<PipelineError>,
+}
+
+/// The way to the mapper, with its overflow policy.
+struct KeyframeSender<'a> {
+    sender: &'a Sender<MapperMessage>,
+    paced: bool,
+    /// Paced: the newest keyframe that found the channel full.
+    waiting: Option<MapperMessage>,
+    deferred: usize,
+}
+
+impl KeyframeSender<'_> {
+    /// Says whether the mapper still listens.
+    fn send(&mut self, message: MapperMessage) -> bool {
+        if !self.paced {
+            return self.sender.send(message).is_ok();
+        }
+        let is_keyframe = matches!(message, MapperMessage::Keyframe(_));
+        match self.sender.try_send(message) {
+            Ok(()) => true,
+            // A pose update that finds no room is followed by a newer one.
+            Err(TrySendError::Full(_)) if !is_keyframe => true,
+            Err(TrySendError::Full(message)) => {
+                self.deferred += usize::from(self.waiting.replace(message).is_some());
+                true
+            }
+            Err(TrySendError::Disconnected(_)) => false,
+        }
+    }
+
+    fn retry(&mut self) -> bool {
+        match self.waiting.take() {
+            Some(message) => self.send(message),
+            None => true,
+        }
+    }
+}
+
+/// Tracks until the frames end, an error, or the mapper stops listening.
+pub(super) fn track(
+    sequence: &Sequence,
+    config: &Config,
+    frames: &Receiver<Frame>,
+    mapper: &Sender<MapperMessage>,
+    progress: &Progress,
+) -> TrackSummary {
+    let mut summary = TrackSummary::default();
+    let mut tracker = match Tracker::new(sequence.camera, &config.tracking) {
+        Ok(tracker) => tracker,
+        Err(error) => return TrackSummary { error: Some(error.into()), ..summary },
+    };
+    let rectifier = Rectifier::new(&sequence.camera, config.map_scale);
+    let mut sender = KeyframeSender { sender: mapper, paced: config.replay.paced, waiting: None, deferred: 0 };
+    for frame in frames {
+        let may_be_keyframe = !config.replay.is_held_out(frame.index);
+        let tracked = match guarded("tracking", || Ok(tracker.track(&frame, may_be_keyframe)?)) {
+            Ok(tracked) => tracked,
+            Err(error) => {
+                summary.error = Some(error);
+                break;
+            }
+        };
+        summary.times_ms.push(tracked.times.total_ms());
+        let lost = tracked.state == TrackingState::Lost;
+        let (frames_done, keyframes) = (frame.index + 1, tracker.keyframes().len());
+        progress.tracking.force_push(TrackingProgress { frames_done, keyframes, lost });
+        if !sender.retry() || !hand_on(&mut sender, &rectifier, &frame, tracked) {
+            break;
+        }
+    }
+    if let Some(message) = sender.waiting.take() {
+        // The last keyframe has no newer one to give way to.
+        let _ = mapper.send(message);
+    }
+    summary.deferred = sender.deferred;
+    summary.trajectory = tracker.trajectory();
+    summary.keyframes = tracker.keyframes();
+    let last_word = summary.keyframes.iter().map(|k| (k.id, k.world_from_camera)).collect();
+    let _ = mapper.send(MapperMessage::PoseUpdate(last_word));
+    summary
+}
+
+fn hand_on(sender: &mut KeyframeSender<'_>, rectifier: &Rectifier, frame: &Frame, tracked: TrackedFrame) -> bool {
+    if !tracked.updates.is_empty() && !sender.send(MapperMessage::PoseUpdate(tracked.updates)) {
+        return false;
+    }
+    let Some(NewKeyframe { id, world_from_camera, covisible }) = tracked.keyframe else { return true };
+    let keyframe = Keyframe {
+        id,
+        world_from_camera,
+        image: rectifier.rectify(frame),
+        covisible: covisible.into_iter().map(|(id, _)| id).collect(),
+    };
+    sender.send(MapperMessage::Keyframe(Box::new(keyframe)))
+}
+
+impl TrackSummary {
+    /// The poses without their frame numbers.
+    pub fn stamped(&self) -> Trajectory {
+        Trajectory { poses: self.trajectory.iter().map(|(_, pose)| *pose).collect() }
+    }
+}
