@@ -19,6 +19,7 @@ mod surface;
 #[cfg(test)]
 mod tests;
 mod texture;
+mod view;
 mod write;
 
 use std::path::{Path, PathBuf};

@@ -92,6 +92,14 @@ impl Shape {
         }
     }
 
+    /// Where a ray in the solid's frame first meets the surface from its visible side.
+    #[inline]
+    pub fn intersect(&self, ray: &Ray) -> Option<f64> {
+        let (near, far) = self.interval(ray.origin, ray.direction)?;
+        let t = if matches!(self, Self::Shell { .. }) { far } else { near };
+        (t > MIN_T).then_some(t)
+    }
+
     /// The interval of a local ray inside the solid.
     #[inline]
     fn interval(&self, o: DVec3, d: DVec3) -> Option<(f64, f64)> {
@@ -234,13 +242,10 @@ fn ball(o: DVec3, d: DVec3, radius: f64) -> Option<(f64, f64)> {
 }
 
 impl Primitive {
-    /// Where the ray first meets the surface from its visible side.
-    #[inline]
+    /// Where a ray in the world first meets the surface from its visible side.
     pub fn intersect(&self, ray: &Ray) -> Option<f64> {
-        let local_from_world = self.world_from_local.transpose();
-        let (near, far) = self.shape.interval(local_from_world * (ray.origin - self.centre), local_from_world * ray.direction)?;
-        let t = if matches!(self.shape, Shape::Shell { .. }) { far } else { near };
-        (t > MIN_T).then_some(t)
+        let direction = self.world_from_local.transpose() * ray.direction;
+        self.shape.intersect(&Ray { origin: self.to_local(ray.origin), direction })
     }
 
     pub fn to_local(&self, p_in_world: DVec3) -> DVec3 {

@@ -12,6 +12,9 @@ const MAX_TAPS: f32 = 5.0;
 /// Most texels along a side; larger charts get coarser texels.
 const MAX_SIDE: f64 = 6000.0;
 
+/// Whole texels by which look-ups may leave a chart to the left or below before they are clipped.
+const OFFSET: f32 = 64.0;
+
 struct Level {
     width: usize,
     height: usize,
@@ -50,7 +53,7 @@ impl Surface {
         let length = major.length().max(1e-6);
         let taps = (length * length / area.max(1e-9)).round().clamp(1.0, MAX_TAPS);
         let width = (area / length).max(length / taps);
-        let level = width.max(1.0).log2();
+        let level = rough_log2(width.max(1.0));
         let mut sum = Vec3::ZERO;
         for tap in 0..taps as u32 {
             sum += self.trilinear(at + major * ((tap as f32 + 0.5) / taps - 0.5), level);
@@ -77,10 +80,11 @@ impl Surface {
 
 impl Level {
     fn bilinear(&self, at: Vec2, wraps: bool) -> Vec3 {
-        let p = at - 0.5;
-        let cell = p.floor();
-        let f = p - cell;
-        let (x, y) = (cell.x as i32, cell.y as i32);
+        // Floors by casts of non-negative numbers, since `floor` is a call on plain x86-64.
+        let p = at.max(Vec2::splat(0.5 - OFFSET)) + (OFFSET - 0.5);
+        let (x, y) = (p.x as i32, p.y as i32);
+        let f = Vec2::new(p.x - x as f32, p.y - y as f32);
+        let (x, y) = (x - OFFSET as i32, y - OFFSET as i32);
         let column = |x: i32| if wraps { x.rem_euclid(self.width as i32) } else { x.clamp(0, self.width as i32 - 1) } as usize;
         let row = |y: i32| y.clamp(0, self.height as i32 - 1) as usize * self.width;
         let (x0, x1, y0, y1) = (column(x), column(x + 1), row(y), row(y + 1));
@@ -109,6 +113,12 @@ impl Level {
         }
         Some(Self { width, height, texels })
     }
+}
+
+/// The logarithm to base 2 with a straight line between powers of two, which is also how levels are blended.
+fn rough_log2(v: f32) -> f32 {
+    let bits = v.to_bits();
+    ((bits >> 23) as f32 - 127.0) + (bits & 0x7F_FFFF) as f32 / 8_388_608.0
 }
 
 fn encode(radiance: Vec3) -> [u16; 3] {
