@@ -16,11 +16,10 @@ use crate::geometry::{Camera, Se3};
 
 /// Distance, metres, at which a texel of furniture (the first) or of the room's shell (the second) is as large as a pixel: about the
 /// nearest at which the camera sees them.
-const TEXEL_RANGE_METRES: (f64, f64) = (0.9, 1.5);
-/// Sub-pixel places of the further samples; with the centre they make a regular 3 x 3 grid.
-const CORNERS: [(f64, f64); 8] =
-    [(-1.0, -1.0), (0.0, -1.0), (1.0, -1.0), (-1.0, 0.0), (1.0, 0.0), (-1.0, 1.0), (0.0, 1.0), (1.0, 1.0)];
-const SUBPIXEL: f64 = 1.0 / 3.0;
+const TEXEL_RANGE_METRES: (f64, f64) = (1.0, 1.7);
+/// Sub-pixel places of the further samples at edges; with the centre they make the five of a die.
+const CORNERS: [(f64, f64); 4] = [(-SUBPIXEL, -SUBPIXEL), (SUBPIXEL, -SUBPIXEL), (-SUBPIXEL, SUBPIXEL), (SUBPIXEL, SUBPIXEL)];
+const SUBPIXEL: f64 = 0.3;
 /// Side of the squares of pixels for which solids are sorted out together.
 const TILE: usize = 8;
 /// Sharpness of highlights on glossy things.
@@ -196,7 +195,7 @@ impl Renderer {
                 }
                 view.candidates(tile.low, tile.high, &mut candidates);
                 for (x, y) in &edges {
-                    let look = |(u, v): &(f64, f64)| self.look(&view, *x, *y, DVec2::new(*u, *v) * SUBPIXEL, &candidates).0;
+                    let look = |(u, v): &(f64, f64)| self.look(&view, *x, *y, DVec2::new(*u, *v), &candidates).0;
                     let i = y * self.width + x;
                     color[i] = (color[i] + CORNERS.iter().map(look).sum::<Vec3>()) / (CORNERS.len() + 1) as f32;
                 }

@@ -5,7 +5,7 @@
 use glam::{DMat3, DVec2, DVec3, dvec3};
 
 use super::room::position;
-use super::shapes::{Primitive, Ray};
+use super::shapes::{Primitive, Ray, Shape};
 use crate::geometry::Se3;
 
 /// A solid with a corner nearer to the camera's plane than this is tried everywhere, metres.
@@ -14,7 +14,8 @@ const NEAR_METRES: f64 = 0.02;
 /// A solid as seen from the camera's centre.
 pub struct Projected {
     pub solid: usize,
-    /// Least depth of its box, metres.
+    shape: Shape,
+    /// Least depth of its box, metres; endless for the room's shell, which is what is left where nothing else is met.
     near: f64,
     low: DVec2,
     high: DVec2,
@@ -76,8 +77,12 @@ impl<'a> View<'a> {
         if near < NEAR_METRES {
             (near, low, high) = (0.0, DVec2::NEG_INFINITY, DVec2::INFINITY);
         }
+        if matches!(solid.shape, Shape::Shell { .. }) {
+            near = f64::MAX;
+        }
         (far > 0.0).then(|| Projected {
             solid: index,
+            shape: solid.shape,
             near,
             low,
             high,
@@ -106,7 +111,7 @@ impl<'a> View<'a> {
                 continue;
             }
             let ray = Ray { origin: item.origin, direction: item.local_from_camera * n.extend(1.0) };
-            if let Some(t) = self.solid(item.solid).shape.intersect(&ray).filter(|t| *t < best.depth_metres) {
+            if let Some(t) = item.shape.intersect(&ray).filter(|t| *t < best.depth_metres) {
                 best = Met { depth_metres: t, item: *k as usize };
             }
         }
