@@ -136,11 +136,6 @@ impl Renderer {
         });
     }
 
-    #[cfg(test)]
-    pub fn solids(&self) -> usize {
-        self.scene.solids.len()
-    }
-
     fn solid(&self, index: usize) -> Primitive {
         let still = self.scene.solids.len();
         match &self.mover {
