@@ -178,11 +178,14 @@ impl Tracker {
         let mut context = Context { map: &mut self.map, pinhole: &self.camera.pinhole, config: &self.config };
         let mut found = None;
         if !self.lost {
-            if let Some(start) = context.from_motion(features, last, &predicted) {
+            let view = context.view_of_last(last);
+            if let Some(start) = context.from_prediction(features, &view, &predicted) {
                 found = Some(context.in_local_map(features, &start, reference)).filter(|f| f.inliers >= needed);
             }
             if found.is_none()
-                && let Some(start) = context.from_last(features, last).or_else(|| context.from_keyframe(features, reference))
+                && let Some(start) = context
+                    .from_view(features, &view)
+                    .or_else(|| context.from_view(features, &context.view_of_keyframe(reference)))
             {
                 found = Some(context.in_local_map(features, &start, reference)).filter(|f| f.inliers >= needed);
             }
