@@ -66,7 +66,7 @@ pub struct Context<'a> {
 impl Context<'_> {
     /// From a view and a predicted pose: searches ever wider around the view's points until enough is found, and again closely
     /// around where a wide search has led.
-    pub fn from_prediction(&self, frame: &FrameFeatures, view: &View, predicted: &Se3) -> Option<Localised> {
+    pub fn by_prediction(&self, frame: &FrameFeatures, view: &View, predicted: &Se3) -> Option<Localised> {
         let mut best: Option<Localised> = None;
         for radius in MOTION_RADII {
             let (mut found, matches) = self.search(frame, view, predicted, radius);
@@ -86,7 +86,7 @@ impl Context<'_> {
     }
 
     /// From a view without a prediction.
-    pub fn from_view(&self, frame: &FrameFeatures, view: &View) -> Option<Localised> {
+    pub fn by_view(&self, frame: &FrameFeatures, view: &View) -> Option<Localised> {
         let rough = pose_from_view(&view.features.features, &view.points, frame, self.pinhole)?;
         let pairs: Vec<(usize, usize)> = rough.matches.iter().map(|m| (m.query, m.feature)).collect();
         let mut found = self.settle(frame, &rough.camera_from_world, &pairs, &view.points, |i| view.landmarks[i]);
@@ -121,12 +121,12 @@ impl Context<'_> {
     }
 
     /// From the map alone, when lost: `reference` and the keyframes that look most alike; the best of them.
-    pub fn from_anywhere(&mut self, frame: &FrameFeatures, reference: usize) -> Option<Localised> {
+    pub fn by_the_map(&mut self, frame: &FrameFeatures, reference: usize) -> Option<Localised> {
         let mut tried = vec![reference];
         tried.extend(similar_keyframes(self.map, frame, RELOCALISATION_KEYFRAMES).into_iter().filter(|k| *k != reference));
         let mut best: Option<Localised> = None;
         for keyframe in tried {
-            let Some(rough) = self.from_view(frame, &self.view_of_keyframe(keyframe)) else { continue };
+            let Some(rough) = self.by_view(frame, &self.view_of_keyframe(keyframe)) else { continue };
             let found = self.in_local_map(frame, &rough, keyframe);
             if best.as_ref().is_none_or(|b| found.inliers > b.inliers) {
                 best = Some(found);

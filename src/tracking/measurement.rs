@@ -44,15 +44,16 @@ pub enum Trust {
 impl Measurement {
     /// Whitened residual at a point in the camera frame; the third entry is 0 without depth. `None` behind the camera.
     pub fn residual(&self, pinhole: &Pinhole, p_in_camera: &Vector3<f64>) -> Option<Vector3<f64>> {
-        if !(p_in_camera.z > NEAR_METRES) {
-            return None;
-        }
-        let inverse_z = 1.0 / p_in_camera.z;
-        Some(Vector3::new(
-            (pinhole.fx * p_in_camera.x * inverse_z + pinhole.cx - self.pixel.x) * self.pixel_weight,
-            (pinhole.fy * p_in_camera.y * inverse_z + pinhole.cy - self.pixel.y) * self.pixel_weight,
-            self.inverse_depth.map_or(0.0, |measured| (inverse_z - measured) * self.depth_weight),
-        ))
+        // NaN is not in front.
+        let in_front = p_in_camera.z > NEAR_METRES;
+        in_front.then(|| {
+            let inverse_z = 1.0 / p_in_camera.z;
+            Vector3::new(
+                (pinhole.fx * p_in_camera.x * inverse_z + pinhole.cx - self.pixel.x) * self.pixel_weight,
+                (pinhole.fy * p_in_camera.y * inverse_z + pinhole.cy - self.pixel.y) * self.pixel_weight,
+                self.inverse_depth.map_or(0.0, |measured| (inverse_z - measured) * self.depth_weight),
+            )
+        })
     }
 
     /// Derivative of [`Self::residual`] by the point in the camera frame.
@@ -80,12 +81,12 @@ impl Measurement {
     /// χ² tests at a point in the camera frame; depth may fail alone.
     pub fn judge(&self, pinhole: &Pinhole, p_in_camera: &Vector3<f64>) -> Trust {
         let Some(r) = self.residual(pinhole, p_in_camera) else { return Trust::Outlier };
-        if !(r.x * r.x + r.y * r.y <= CHI2_PIXEL) {
-            Trust::Outlier
-        } else if self.inverse_depth.is_some() && r.z * r.z <= CHI2_DEPTH {
-            Trust::Full
-        } else {
-            Trust::PixelOnly
+        let pixel_agrees = r.x * r.x + r.y * r.y <= CHI2_PIXEL;
+        let depth_agrees = self.inverse_depth.is_some() && r.z * r.z <= CHI2_DEPTH;
+        match (pixel_agrees, depth_agrees) {
+            (false, _) => Trust::Outlier,
+            (true, true) => Trust::Full,
+            (true, false) => Trust::PixelOnly,
         }
     }
 
