@@ -52,34 +52,44 @@ fn main() -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
+/// A position estimated and its truth, metres.
+struct Pair {
+    timestamp_s: f64,
+    ours: Vector3<f64>,
+    truth: Vector3<f64>,
+}
+
 fn print_ate(trajectory: &Trajectory, truth: &Trajectory) {
     let nearest = |t: f64| {
         let by_time = |a: &&StampedPose, b: &&StampedPose| (a.timestamp_s - t).abs().total_cmp(&(b.timestamp_s - t).abs());
         trajectory.poses.iter().min_by(by_time).filter(|p| (p.timestamp_s - t).abs() <= MAX_TIME_DIFFERENCE_S)
     };
-    let pairs: Vec<(f64, Vector3<f64>, Vector3<f64>)> =
-        truth.poses.iter().filter_map(|t| nearest(t.timestamp_s).map(|p| (t.timestamp_s, position(p), position(t)))).collect();
+    let pair = |t: &StampedPose| {
+        nearest(t.timestamp_s).map(|p| Pair { timestamp_s: t.timestamp_s, ours: position(p), truth: position(t) })
+    };
+    let mut pairs: Vec<Pair> = truth.poses.iter().filter_map(pair).collect();
     if pairs.len() < 3 {
         println!("too few poses with truth");
         return;
     }
-    let mean = |pick: fn(&(f64, Vector3<f64>, Vector3<f64>)) -> Vector3<f64>| {
-        pairs.iter().map(pick).sum::<Vector3<f64>>() / pairs.len() as f64
-    };
-    let (from_mean, to_mean) = (mean(|p| p.1), mean(|p| p.2));
-    let covariance: Matrix3<f64> = pairs.iter().map(|p| (p.2 - to_mean) * (p.1 - from_mean).transpose()).sum();
+    let count = pairs.len() as f64;
+    let ours_mean = pairs.iter().map(|p| p.ours).sum::<Vector3<f64>>() / count;
+    let truth_mean = pairs.iter().map(|p| p.truth).sum::<Vector3<f64>>() / count;
+    for p in &mut pairs {
+        p.ours -= ours_mean;
+        p.truth -= truth_mean;
+    }
+    let covariance: Matrix3<f64> = pairs.iter().map(|p| p.truth * p.ours.transpose()).sum();
     let svd = covariance.svd(true, true);
     let (u, v_t) = (svd.u.unwrap_or_default(), svd.v_t.unwrap_or_default());
     let flip = Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, (u * v_t).determinant().signum()));
     let rotation = u * flip * v_t;
-    let errors: Vec<(f64, f64)> =
-        pairs.iter().map(|(t, from, to)| (*t, (rotation * (from - from_mean) + to_mean - to).norm())).collect();
+    let errors: Vec<(f64, f64)> = pairs.iter().map(|p| (p.timestamp_s, (rotation * p.ours - p.truth).norm())).collect();
     let rmse = (errors.iter().map(|e| e.1 * e.1).sum::<f64>() / errors.len() as f64).sqrt();
     let worst = errors.iter().max_by(|a, b| a.1.total_cmp(&b.1)).copied().unwrap_or_default();
     // What scale would fit best says whether depth or drift is at fault.
-    let spread: f64 = pairs.iter().map(|p| (p.1 - from_mean).norm_squared()).sum();
-    let scale =
-        (rotation * pairs.iter().map(|p| (p.1 - from_mean) * (p.2 - to_mean).transpose()).sum::<Matrix3<f64>>()).trace() / spread;
+    let spread: f64 = pairs.iter().map(|p| p.ours.norm_squared()).sum();
+    let scale = pairs.iter().map(|p| (rotation * p.ours).dot(&p.truth)).sum::<f64>() / spread;
     println!(
         "ATE RMSE {:.3} cm over {} poses, worst {:.2} cm at {:.2} s, best scale {scale:.4}",
         rmse * 100.0,

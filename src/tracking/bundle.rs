@@ -5,7 +5,7 @@
 
 use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, Matrix6x3, Point3, Vector3, Vector6};
 
-use super::measurement::{Measurement, Trust, huber, point_by_pose};
+use super::measurement::{Measurement, Trust, point_by_pose};
 use crate::geometry::{Pinhole, Se3, se3};
 
 /// Damping that gives up: no step helps any more.
@@ -96,7 +96,7 @@ impl BundleProblem {
         for o in &self.observations {
             let Some(measurement) = o.measurement.trusted(o.trust) else { continue };
             match measurement.residual(pinhole, &(self.poses[o.pose] * self.points[o.point]).coords) {
-                Some(r) => sum += huber(r.norm_squared(), measurement.huber_threshold()).0,
+                Some(r) => sum += Measurement::robust(&r).0,
                 None => return f64::INFINITY,
             }
         }
@@ -116,14 +116,15 @@ impl BundleProblem {
             let pose = &self.poses[o.pose];
             let p_in_camera = (pose * self.points[o.point]).coords;
             let Some(residual) = measurement.residual(pinhole, &p_in_camera) else { continue };
-            let weight = huber(residual.norm_squared(), measurement.huber_threshold()).1;
+            let weights = Matrix3::from_diagonal(&Measurement::robust(&residual).1);
             let by_camera_point = measurement.jacobian(pinhole, &p_in_camera);
             let by_point = by_camera_point * pose.rotation.to_rotation_matrix().matrix();
-            system.hessian_points[o.point] += by_point.transpose() * by_point * weight;
-            system.gradient_points[o.point] += by_point.transpose() * residual * weight;
+            let weighted = by_point.transpose() * weights;
+            system.hessian_points[o.point] += weighted * by_point;
+            system.gradient_points[o.point] += weighted * residual;
             if o.pose < self.free_poses {
                 let by_pose = by_camera_point * point_by_pose(&p_in_camera);
-                let weighted = by_pose.transpose() * weight;
+                let weighted = by_pose.transpose() * weights;
                 system.hessian_poses[o.pose] += weighted * by_pose;
                 system.gradient_poses[o.pose] += weighted * residual;
                 system.mixed.push(Linearised { observation: index, pose: o.pose, pose_by_point: weighted * by_point });

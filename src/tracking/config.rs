@@ -56,7 +56,7 @@ impl Default for TrackingConfig {
             min_depth_metres: 0.2,
             max_depth_metres: 6.0,
             pixel_sigma: 1.0,
-            inverse_depth_sigma: 0.03,
+            inverse_depth_sigma: 0.02,
             depth_edge_ratio: 0.05,
             min_initial_landmarks: 50,
             min_inliers: 20,

@@ -1,6 +1,8 @@
 //! The pose of one frame against the map: from the last frame's points where motion can be predicted, from a known view where not,
 //! then from the local map (Mur-Artal & Tardós, *ORB-SLAM2*, 2017).
 
+use std::sync::Arc;
+
 use nalgebra::Point3;
 
 use super::TrackingConfig;
@@ -19,6 +21,8 @@ const MOTION_RULES: Rules = Rules { max_distance: 80, ratio: 0.9, check_rotation
 /// Matches with which a search is wide enough, and inliers with which its pose is believed enough to look at the map.
 const MOTION_MATCHES: usize = 40;
 const MOTION_INLIERS: usize = 15;
+/// Inliers that make it worth to look more closely around a rough pose.
+const ROUGH_INLIERS: usize = 8;
 /// Search radius around landmarks, pixels at the finest level: seen from about the known direction, and otherwise.
 const MAP_RADIUS_STRAIGHT: f64 = 5.0;
 const MAP_RADIUS_OBLIQUE: f64 = 8.0;
@@ -45,6 +49,13 @@ pub struct Localised {
     pub rough: bool,
 }
 
+/// Features whose points in the world are known (`None` where not), and the landmarks among these.
+pub struct View {
+    features: Arc<FrameFeatures>,
+    points: Vec<Option<Point3<f64>>>,
+    landmarks: Vec<Option<usize>>,
+}
+
 /// What the searches need.
 pub struct Context<'a> {
     pub map: &'a mut Map,
@@ -53,60 +64,69 @@ pub struct Context<'a> {
 }
 
 impl Context<'_> {
-    /// From the last frame and the pose predicted for this one.
-    pub fn from_motion(&self, frame: &FrameFeatures, last: &LastFrame, predicted: &Se3) -> Option<Localised> {
-        let known = self.points_of(last);
+    /// From a view and a predicted pose: searches ever wider around the view's points until enough is found, and again closely
+    /// around where a wide search has led.
+    pub fn by_prediction(&self, frame: &FrameFeatures, view: &View, predicted: &Se3) -> Option<Localised> {
         let mut best: Option<Localised> = None;
         for radius in MOTION_RADII {
-            let (mut asked, mut queries) = (Vec::new(), Vec::new());
-            for (index, feature) in last.features.features.iter().enumerate() {
-                let Some(point) = known[index] else { continue };
-                let p_in_camera = (predicted * point).coords;
-                let Some(pixel) = self.pinhole.project(&p_in_camera).filter(|p| self.pinhole.contains(p, 0.0)) else { continue };
-                asked.push(index);
-                queries.push(Query {
-                    pixel,
-                    radius: radius * self.config.pyramid_scale.powi(feature.octave.into()),
-                    octaves: feature.octave.saturating_sub(1)..=feature.octave + 1,
-                    descriptor: feature.descriptor,
-                    angle_rad: feature.angle_rad,
-                    inverse_depth: 1.0 / p_in_camera.z,
-                });
+            let (mut found, matches) = self.search(frame, view, predicted, radius);
+            if radius > MOTION_RADII[0] && found.inliers >= ROUGH_INLIERS {
+                let (again, _) = self.search(frame, view, &found.camera_from_world, MOTION_RADII[0]);
+                found = if again.inliers > found.inliers { again } else { found };
             }
-            let matches = match_by_projection(frame, &[], &queries, &MOTION_RULES);
-            let enough = matches.len() >= MOTION_MATCHES;
-            let pairs: Vec<(usize, usize)> = matches.iter().map(|m| (asked[m.query], m.feature)).collect();
-            let found = self.settle(frame, predicted, &pairs, &known, |i| last.landmarks[i]);
+            let enough = matches >= MOTION_MATCHES && 2 * found.inliers >= matches;
             if best.as_ref().is_none_or(|b| found.inliers > b.inliers) {
                 best = Some(found);
             }
-            if enough && best.as_ref().is_some_and(|b| 2 * b.inliers >= matches.len()) {
+            if enough {
                 break;
             }
         }
         best.filter(|b| b.inliers >= MOTION_INLIERS)
     }
 
-    /// From the last frame without a prediction.
-    pub fn from_last(&self, frame: &FrameFeatures, last: &LastFrame) -> Option<Localised> {
-        let known = self.points_of(last);
-        self.from_view(frame, &last.features, &known, |i| last.landmarks[i])
+    /// From a view without a prediction.
+    pub fn by_view(&self, frame: &FrameFeatures, view: &View) -> Option<Localised> {
+        let rough = pose_from_view(&view.features.features, &view.points, frame, self.pinhole)?;
+        let pairs: Vec<(usize, usize)> = rough.matches.iter().map(|m| (m.query, m.feature)).collect();
+        let mut found = self.settle(frame, &rough.camera_from_world, &pairs, &view.points, |i| view.landmarks[i]);
+        if found.inliers >= ROUGH_INLIERS {
+            let (guided, _) = self.search(frame, view, &found.camera_from_world, MOTION_RADII[1]);
+            found = if guided.inliers > found.inliers { guided } else { found };
+        }
+        found.rough = true;
+        (found.inliers >= MOTION_INLIERS).then_some(found)
     }
 
-    /// From a keyframe's landmarks without a prediction.
-    pub fn from_keyframe(&self, frame: &FrameFeatures, keyframe: usize) -> Option<Localised> {
-        let view = &self.map.keyframes[keyframe];
-        let known: Vec<Option<Point3<f64>>> = view.landmarks.iter().map(|l| l.map(|l| self.map.landmarks[l].position)).collect();
-        self.from_view(frame, &view.features, &known, |i| view.landmarks[i])
+    /// The last frame as a view: its landmarks, and temporary points from depth for its other features.
+    pub fn view_of_last(&self, last: &LastFrame) -> View {
+        let world_from_camera = last.camera_from_world.inverse();
+        let temporary = |i| last.features.point_in_camera(i, self.pinhole).map(|p| world_from_camera * p);
+        let point = |i: usize| last.landmarks[i].map(|l| self.map.landmarks[l].position).or_else(|| temporary(i));
+        View {
+            features: last.features.clone(),
+            points: (0..last.features.len()).map(point).collect(),
+            landmarks: last.landmarks.clone(),
+        }
+    }
+
+    /// A keyframe's landmarks as a view.
+    pub fn view_of_keyframe(&self, keyframe: usize) -> View {
+        let keyframe = &self.map.keyframes[keyframe];
+        View {
+            features: keyframe.features.clone(),
+            points: keyframe.landmarks.iter().map(|l| l.map(|l| self.map.landmarks[l].position)).collect(),
+            landmarks: keyframe.landmarks.clone(),
+        }
     }
 
     /// From the map alone, when lost: `reference` and the keyframes that look most alike; the best of them.
-    pub fn from_anywhere(&mut self, frame: &FrameFeatures, reference: usize) -> Option<Localised> {
+    pub fn by_the_map(&mut self, frame: &FrameFeatures, reference: usize) -> Option<Localised> {
         let mut tried = vec![reference];
         tried.extend(similar_keyframes(self.map, frame, RELOCALISATION_KEYFRAMES).into_iter().filter(|k| *k != reference));
         let mut best: Option<Localised> = None;
         for keyframe in tried {
-            let Some(rough) = self.from_keyframe(frame, keyframe) else { continue };
+            let Some(rough) = self.by_view(frame, &self.view_of_keyframe(keyframe)) else { continue };
             let found = self.in_local_map(frame, &rough, keyframe);
             if best.as_ref().is_none_or(|b| found.inliers > b.inliers) {
                 best = Some(found);
@@ -181,27 +201,26 @@ impl Context<'_> {
         Localised { camera_from_world: estimate.camera_from_world, landmarks, inliers: estimate.inliers, rough: false }
     }
 
-    fn from_view(
-        &self,
-        frame: &FrameFeatures,
-        view: &FrameFeatures,
-        known: &[Option<Point3<f64>>],
-        landmark_of: impl Fn(usize) -> Option<usize>,
-    ) -> Option<Localised> {
-        let rough = pose_from_view(&view.features, known, frame, self.pinhole)?;
-        let pairs: Vec<(usize, usize)> = rough.matches.iter().map(|m| (m.query, m.feature)).collect();
-        let mut found = self.settle(frame, &rough.camera_from_world, &pairs, known, landmark_of);
-        found.rough = true;
-        (found.inliers >= MOTION_INLIERS).then_some(found)
-    }
-
-    /// Points of the last frame's features in the world: landmarks, and for the others temporary points from depth.
-    fn points_of(&self, last: &LastFrame) -> Vec<Option<Point3<f64>>> {
-        let world_from_camera = last.camera_from_world.inverse();
-        let temporary = |i| last.features.point_in_camera(i, self.pinhole).map(|p| world_from_camera * p);
-        (0..last.features.len())
-            .map(|i| last.landmarks[i].map(|l| self.map.landmarks[l].position).or_else(|| temporary(i)))
-            .collect()
+    /// Looks for a view's points around where `pose` shows them, and settles the pose; also returns the number of matches.
+    fn search(&self, frame: &FrameFeatures, view: &View, pose: &Se3, radius: f64) -> (Localised, usize) {
+        let (mut asked, mut queries) = (Vec::new(), Vec::new());
+        for (index, (feature, point)) in view.features.features.iter().zip(&view.points).enumerate() {
+            let Some(point) = point else { continue };
+            let p_in_camera = (pose * point).coords;
+            let Some(pixel) = self.pinhole.project(&p_in_camera).filter(|p| self.pinhole.contains(p, 0.0)) else { continue };
+            asked.push(index);
+            queries.push(Query {
+                pixel,
+                radius: radius * self.config.pyramid_scale.powi(feature.octave.into()),
+                octaves: feature.octave.saturating_sub(1)..=feature.octave + 1,
+                descriptor: feature.descriptor,
+                angle_rad: feature.angle_rad,
+                inverse_depth: 1.0 / p_in_camera.z,
+            });
+        }
+        let matches = match_by_projection(frame, &[], &queries, &MOTION_RULES);
+        let pairs: Vec<(usize, usize)> = matches.iter().map(|m| (asked[m.query], m.feature)).collect();
+        (self.settle(frame, pose, &pairs, &view.points, |i| view.landmarks[i]), matches.len())
     }
 
     fn local_landmarks(&self, start: &Localised, reference: usize) -> Vec<usize> {

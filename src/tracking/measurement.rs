@@ -9,9 +9,12 @@ use nalgebra::{Matrix3, Matrix3x6, Vector2, Vector3};
 use crate::geometry::Pinhole;
 use crate::geometry::se3::skew;
 
-/// 95% of true measurements lie below these, for 2 and 3 degrees of freedom.
-pub const CHI2_PIXEL: f64 = 5.991;
-pub const CHI2_WITH_DEPTH: f64 = 7.815;
+/// 95% of true pixels lie below this (χ², 2 degrees of freedom).
+const CHI2_PIXEL: f64 = 5.991;
+/// Squared depth residuals beyond this are wrong: wide, for the tails of a depth sensor are heavy.
+const CHI2_DEPTH: f64 = 9.0;
+/// Squared depth residuals beyond this pull less and less.
+const HUBER_DEPTH: f64 = 1.0;
 
 /// Points nearer than this to the camera's plane, or behind it, are not seen, metres.
 const NEAR_METRES: f64 = 1e-2;
@@ -41,15 +44,16 @@ pub enum Trust {
 impl Measurement {
     /// Whitened residual at a point in the camera frame; the third entry is 0 without depth. `None` behind the camera.
     pub fn residual(&self, pinhole: &Pinhole, p_in_camera: &Vector3<f64>) -> Option<Vector3<f64>> {
-        if !(p_in_camera.z > NEAR_METRES) {
-            return None;
-        }
-        let inverse_z = 1.0 / p_in_camera.z;
-        Some(Vector3::new(
-            (pinhole.fx * p_in_camera.x * inverse_z + pinhole.cx - self.pixel.x) * self.pixel_weight,
-            (pinhole.fy * p_in_camera.y * inverse_z + pinhole.cy - self.pixel.y) * self.pixel_weight,
-            self.inverse_depth.map_or(0.0, |measured| (inverse_z - measured) * self.depth_weight),
-        ))
+        // NaN is not in front.
+        let in_front = p_in_camera.z > NEAR_METRES;
+        in_front.then(|| {
+            let inverse_z = 1.0 / p_in_camera.z;
+            Vector3::new(
+                (pinhole.fx * p_in_camera.x * inverse_z + pinhole.cx - self.pixel.x) * self.pixel_weight,
+                (pinhole.fy * p_in_camera.y * inverse_z + pinhole.cy - self.pixel.y) * self.pixel_weight,
+                self.inverse_depth.map_or(0.0, |measured| (inverse_z - measured) * self.depth_weight),
+            )
+        })
     }
 
     /// Derivative of [`Self::residual`] by the point in the camera frame.
@@ -74,23 +78,24 @@ impl Measurement {
         }
     }
 
-    /// χ² tests at a point in the camera frame.
+    /// χ² tests at a point in the camera frame; depth may fail alone.
     pub fn judge(&self, pinhole: &Pinhole, p_in_camera: &Vector3<f64>) -> Trust {
         let Some(r) = self.residual(pinhole, p_in_camera) else { return Trust::Outlier };
-        let pixel = r.x * r.x + r.y * r.y;
-        let all = pixel + r.z * r.z;
-        if self.inverse_depth.is_some() && all <= CHI2_WITH_DEPTH {
-            Trust::Full
-        } else if pixel <= CHI2_PIXEL {
-            Trust::PixelOnly
-        } else {
-            Trust::Outlier
+        let pixel_agrees = r.x * r.x + r.y * r.y <= CHI2_PIXEL;
+        let depth_agrees = self.inverse_depth.is_some() && r.z * r.z <= CHI2_DEPTH;
+        match (pixel_agrees, depth_agrees) {
+            (false, _) => Trust::Outlier,
+            (true, true) => Trust::Full,
+            (true, false) => Trust::PixelOnly,
         }
     }
 
-    /// Threshold of the Huber kernel on the squared residual.
-    pub fn huber_threshold(&self) -> f64 {
-        if self.inverse_depth.is_some() { CHI2_WITH_DEPTH } else { CHI2_PIXEL }
+    /// Robust cost of a whitened residual, and the weights that it gives the residual's entries. Pixel and depth have a kernel each,
+    /// so that a wrong depth does not cost the pixel its say.
+    pub fn robust(residual: &Vector3<f64>) -> (f64, Vector3<f64>) {
+        let (pixel_cost, pixel) = huber(residual.x * residual.x + residual.y * residual.y, CHI2_PIXEL);
+        let (depth_cost, depth) = huber(residual.z * residual.z, HUBER_DEPTH);
+        (pixel_cost + depth_cost, Vector3::new(pixel, pixel, depth))
     }
 }
 

@@ -3,9 +3,9 @@
 //! Several rounds; after each, every measurement is judged anew by χ² and may come back. Early rounds use Huber's kernel
 //! (Mur-Artal & Tardós, *ORB-SLAM2*, 2017, sec. III-C). A measurement whose depth alone disagrees keeps its pixel.
 
-use nalgebra::{Matrix6, Point3, Vector6};
+use nalgebra::{Matrix3, Matrix6, Point3, Vector3, Vector6};
 
-use super::measurement::{Measurement, Trust, huber, point_by_pose};
+use super::measurement::{Measurement, Trust, point_by_pose};
 use crate::geometry::{Pinhole, Se3, se3};
 
 const ROUNDS: usize = 4;
@@ -96,11 +96,12 @@ fn linearise(
             cost += BEHIND_COST;
             continue;
         };
-        let squared = residual.norm_squared();
-        let (rho, weight) = if robust { huber(squared, measurement.huber_threshold()) } else { (squared, 1.0) };
+        let (rho, weights) =
+            if robust { Measurement::robust(&residual) } else { (residual.norm_squared(), Vector3::repeat(1.0)) };
         let j = measurement.jacobian(pinhole, &p_in_camera) * point_by_pose(&p_in_camera);
-        hessian += j.transpose() * j * weight;
-        gradient += j.transpose() * residual * weight;
+        let weighted = j.transpose() * Matrix3::from_diagonal(&weights);
+        hessian += weighted * j;
+        gradient += weighted * residual;
         cost += rho;
     }
     (hessian, gradient, cost)

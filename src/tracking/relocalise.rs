@@ -12,7 +12,7 @@ use crate::geometry::{Pinhole, Se3};
 
 const ALL_RULES: Rules = Rules { max_distance: 64, ratio: 0.8, check_rotation: true };
 /// Fewer matches than this are chance.
-const MIN_MATCHES: usize = 12;
+const MIN_MATCHES: usize = 8;
 const RANSAC_ITERATIONS: i32 = 200;
 /// Reprojection error of a RANSAC inlier, pixels.
 const RANSAC_PIXELS: f32 = 4.0;

@@ -178,18 +178,20 @@ impl Tracker {
         let mut context = Context { map: &mut self.map, pinhole: &self.camera.pinhole, config: &self.config };
         let mut found = None;
         if !self.lost {
-            if let Some(start) = context.from_motion(features, last, &predicted) {
+            let view = context.view_of_last(last);
+            if let Some(start) = context.by_prediction(features, &view, &predicted) {
                 found = Some(context.in_local_map(features, &start, reference)).filter(|f| f.inliers >= needed);
             }
             if found.is_none()
-                && let Some(start) = context.from_last(features, last).or_else(|| context.from_keyframe(features, reference))
+                && let Some(start) =
+                    context.by_view(features, &view).or_else(|| context.by_view(features, &context.view_of_keyframe(reference)))
             {
                 found = Some(context.in_local_map(features, &start, reference)).filter(|f| f.inliers >= needed);
             }
         }
         if found.is_none() {
             let needed = self.config.min_relocalisation_inliers;
-            found = context.from_anywhere(features, reference).filter(|f| f.inliers >= needed);
+            found = context.by_the_map(features, reference).filter(|f| f.inliers >= needed);
         }
         found.filter(|f| f.camera_from_world.to_homogeneous().iter().all(|v| v.is_finite()))
     }

@@ -2,7 +2,7 @@
 
 use glam::DVec3;
 
-use super::shapes::{Primitive, Ray};
+use super::shapes::{Primitive, Ray, larger, smaller};
 
 /// So few solids are not worth another split.
 const LEAF_SIZE: usize = 2;
@@ -83,7 +83,10 @@ impl Bvh {
             let index = stack[depth];
             let node = &self.nodes[index as usize];
             let (a, b) = ((node.low - ray.origin) * inverse, (node.high - ray.origin) * inverse);
-            let (near, far) = (a.min(b).max_element(), a.max(b).min_element());
+            let (near, far) = (
+                larger(larger(smaller(a.x, b.x), smaller(a.y, b.y)), smaller(a.z, b.z)),
+                smaller(smaller(larger(a.x, b.x), larger(a.y, b.y)), larger(a.z, b.z)),
+            );
             if near > far || far < 0.0 || near > limit {
                 continue;
             }

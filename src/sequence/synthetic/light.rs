@@ -17,7 +17,7 @@ const CELL_METRES: f64 = 0.06;
 const CELLS: (f64, f64) = (2.0, 120.0);
 /// Samples along each side of an area light.
 const LIGHT_SIDE: usize = 4;
-const GATHER_RAYS: usize = 64;
+const GATHER_RAYS: usize = 80;
 /// Rays start this far off the surface, metres.
 const LIFT: f64 = 1e-3;
 /// Mean radiance of a white surface in the picture: bright, but short of clipping.

@@ -19,6 +19,7 @@ mod surface;
 #[cfg(test)]
 mod tests;
 mod texture;
+mod view;
 mod write;
 
 use std::path::{Path, PathBuf};
@@ -105,18 +106,19 @@ impl SceneConfig {
     }
 }
 
-/// A scene that is built and ready to be rendered frame by frame.
-struct Recording<'a> {
-    config: &'a SceneConfig,
+/// A furnished room and the way through it, checked, before anything is lit or rendered.
+struct Plan {
     path: CameraPath,
-    renderer: Renderer,
+    solids: Vec<Primitive>,
+    mover: Option<room::Mover>,
+    /// Times and poses along the path.
+    sampled: Vec<(f64, Se3)>,
 }
 
-impl<'a> Recording<'a> {
-    fn new(config: &'a SceneConfig) -> Result<Self, SceneError> {
+impl Plan {
+    fn new(config: &SceneConfig) -> Result<Self, SceneError> {
         config.validate()?;
-        let camera = config.camera();
-        check_lens(&camera)?;
+        check_lens(&config.camera())?;
         let path = CameraPath::new(config)?;
         let every = config.frames.div_ceil(PATH_SAMPLES);
         let timed = |frame: usize| (frame as f64 / config.fps, path.world_from_camera(frame as f64 / config.fps));
@@ -125,7 +127,21 @@ impl<'a> Recording<'a> {
         let solids = room::furnish(config, &poses)?;
         check_clearance(config, &path, &solids)?;
         let mover = config.degradation.moving_object.then(|| room::Mover::new(config, &sampled, &solids)).transpose()?;
-        let renderer = Renderer::new(&camera, solids, mover, config.room.gloss);
+        Ok(Self { path, solids, mover, sampled })
+    }
+}
+
+/// A scene that is ready to be rendered frame by frame.
+struct Recording<'a> {
+    config: &'a SceneConfig,
+    path: CameraPath,
+    renderer: Renderer,
+}
+
+impl<'a> Recording<'a> {
+    fn new(config: &'a SceneConfig) -> Result<Self, SceneError> {
+        let Plan { path, solids, mover, sampled } = Plan::new(config)?;
+        let renderer = Renderer::new(&config.camera(), solids, mover, config.room.gloss);
         let moment = |(time_s, pose): &(f64, Se3)| Moment { world_from_camera: *pose, time_s: *time_s, subpixel: DVec2::ZERO };
         renderer.warm_up(&sampled.iter().step_by(8).map(moment).collect::<Vec<_>>());
         Ok(Self { config, path, renderer })

@@ -28,13 +28,18 @@ pub fn ramp(low: f32, high: f32, x: f32) -> f32 {
 
 /// Value noise in `0..1`, one feature per unit of `p`.
 pub fn value(p: Vec2, seed: u32) -> f32 {
-    let cell = p.floor();
-    let f = p - cell;
-    let (x, y) = (cell.x as i32, cell.y as i32);
+    let (x, y, f) = cell(p);
     let (u, v) = (smooth(f.x), smooth(f.y));
     let bottom = unit(x, y, seed) * (1.0 - u) + unit(x + 1, y, seed) * u;
     let top = unit(x, y + 1, seed) * (1.0 - u) + unit(x + 1, y + 1, seed) * u;
     bottom * (1.0 - v) + top * v
+}
+
+/// The lattice cell of a point, and its place in it. (Casts, since `floor` is a call on plain x86-64.)
+fn cell(p: Vec2) -> (i32, i32, Vec2) {
+    let down = |v: f32| v as i32 - i32::from(v < 0.0);
+    let (x, y) = (down(p.x), down(p.y));
+    (x, y, Vec2::new(p.x - x as f32, p.y - y as f32))
 }
 
 /// Sum of `octaves` of value noise, each of twice the frequency and half the height; in `0..1`.
@@ -49,21 +54,25 @@ pub fn octaves(p: Vec2, octaves: u32, seed: u32) -> f32 {
     sum / total
 }
 
-/// Scattered round spots of differing size: 1 inside a spot, 0 outside, at most one spot per unit cell.
-/// Returns the coverage and the spot's own random number.
+/// Scattered spots of differing size and roundness: 1 inside a spot, 0 outside, at most one spot per unit cell.
+/// `radius` is the largest, up to 0.6. Returns the coverage and the spot's own random number.
 pub fn spots(p: Vec2, radius: f32, seed: u32) -> (f32, f32) {
-    let cell = p.floor();
+    let (x, y, f) = cell(p);
+    // Centres keep a quarter of a cell from its border, so only the four nearest cells can reach the point.
+    let (left, below) = (x - i32::from(f.x < 0.5), y - i32::from(f.y < 0.5));
     let (mut cover, mut tag) = (0.0f32, 0.0);
-    for dy in -1..=1 {
-        for dx in -1..=1 {
-            let (x, y) = (cell.x as i32 + dx, cell.y as i32 + dy);
-            let centre = Vec2::new(x as f32 + unit(x, y, seed), y as f32 + unit(x, y, seed ^ 0x51));
-            let size = radius * (0.35 + 0.65 * unit(x, y, seed ^ 0xA7));
-            let squeeze = 0.6 + 0.8 * unit(x, y, seed ^ 0x3D);
-            let d = ((p - centre) * Vec2::new(squeeze, 1.0 / squeeze)).length();
-            let here = 1.0 - ramp(size * 0.85, size, d);
+    for (i, j) in [(left, below), (left + 1, below), (left, below + 1), (left + 1, below + 1)] {
+        let h = hash(i, j, seed);
+        let part = |shift: u32| ((h >> shift) & 0xFF) as f32 / 255.0;
+        let centre = Vec2::new(i as f32 + 0.25 + 0.5 * part(0), j as f32 + 0.25 + 0.5 * part(8));
+        let size = radius * (0.35 + 0.65 * part(16));
+        let squeeze = 0.8 + 0.45 * part(24);
+        let d = (p - centre) * Vec2::new(squeeze, 1.0 / squeeze);
+        let square = d.length_squared();
+        if square < size * size {
+            let here = 1.0 - ramp(size * 0.85, size, square.sqrt());
             if here > cover {
-                (cover, tag) = (here, unit(x, y, seed ^ 0xF1));
+                (cover, tag) = (here, unit(i, j, seed ^ 0xF1));
             }
         }
     }

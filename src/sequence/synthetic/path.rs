@@ -194,11 +194,11 @@ mod tests {
     #[test]
     fn a_loop_returns_to_its_start_and_says_how_many_frames_it_takes() {
         let edit = |c: &mut SceneConfig| {
-            (c.path.kind, c.path.rounds, c.frames) = (PathKind::Loop, 2, 900);
+            (c.path.kind, c.path.rounds, c.frames) = (PathKind::Loop, 2, 1200);
             (c.path.shake_metres, c.path.shake_degrees) = (0.0, 0.0);
         };
         let (path, config) = path(edit);
-        let (start, end) = (path.world_from_camera(0.0), path.world_from_camera(899.0 / config.fps));
+        let (start, end) = (path.world_from_camera(0.0), path.world_from_camera(1199.0 / config.fps));
         assert!(
             (start.translation.vector - end.translation.vector).norm() < 1e-6 && start.rotation.angle_to(&end.rotation) < 1e-6
         );

@@ -2,24 +2,26 @@
 
 use std::sync::OnceLock;
 
-use glam::{DMat3, DVec2, DVec3, Vec3, dvec3};
+use glam::{DVec2, DVec3, Vec3};
 use nalgebra::Vector2;
 use rayon::prelude::*;
 
 use super::light::{AreaLight, LightGrid, Lighting, Scene};
-use super::room::{Mover, position};
+use super::room::Mover;
 use super::shapes::{Primitive, Ray};
 use super::surface::Surface;
 use super::texture::Place;
+use super::view::View;
 use crate::geometry::{Camera, Se3};
 
 /// Distance, metres, at which a texel of furniture (the first) or of the room's shell (the second) is as large as a pixel: about the
 /// nearest at which the camera sees them.
-const TEXEL_RANGE_METRES: (f64, f64) = (0.9, 1.5);
-/// Sub-pixel places of the further samples; with the centre they make a regular 3 x 3 grid.
-const CORNERS: [(f64, f64); 8] =
-    [(-1.0, -1.0), (0.0, -1.0), (1.0, -1.0), (-1.0, 0.0), (1.0, 0.0), (-1.0, 1.0), (0.0, 1.0), (1.0, 1.0)];
-const SUBPIXEL: f64 = 1.0 / 3.0;
+const TEXEL_RANGE_METRES: (f64, f64) = (1.0, 1.7);
+/// Sub-pixel places of the further samples at edges; with the centre they make the five of a die.
+const CORNERS: [(f64, f64); 4] = [(-SUBPIXEL, -SUBPIXEL), (SUBPIXEL, -SUBPIXEL), (-SUBPIXEL, SUBPIXEL), (SUBPIXEL, SUBPIXEL)];
+const SUBPIXEL: f64 = 0.3;
+/// Side of the squares of pixels for which solids are sorted out together.
+const TILE: usize = 8;
 /// Sharpness of highlights on glossy things.
 const SHININESS: f32 = 50.0;
 
@@ -62,6 +64,7 @@ pub struct Renderer {
     height: usize,
     /// Normalised image coordinates (z = 1) of each pixel's centre.
     rays: Vec<DVec2>,
+    tiles: Vec<Tile>,
     focal: f64,
 }
 
@@ -79,7 +82,10 @@ impl Renderer {
             let n = camera.distortion.undistort(&Vector2::new((recorded.x - p.cx) / p.fx, (recorded.y - p.cy) / p.fy));
             DVec2::new(n.x, n.y)
         };
+        let (width, height) = (p.width as usize, p.height as usize);
+        let rays: Vec<DVec2> = (0..p.width * p.height).into_par_iter().map(ray).collect();
         Self {
+            tiles: tiles(width, height, &rays),
             lights: scene.lights(),
             scene,
             lighting,
@@ -87,22 +93,32 @@ impl Renderer {
             gloss: gloss as f32,
             surfaces,
             mover_light,
-            width: p.width as usize,
-            height: p.height as usize,
-            rays: (0..p.width * p.height).into_par_iter().map(ray).collect(),
+            width,
+            height,
+            rays,
             focal: p.fx.max(p.fy),
         }
     }
 
     /// Bakes in parallel what a few frames see; the rest is baked when met. Changes nothing but the time.
     pub fn warm_up(&self, moments: &[Moment]) {
-        const STRIDE: usize = 6;
         let mut seen: Vec<(usize, usize)> = moments
             .par_iter()
             .flat_map_iter(|moment| {
-                let view = View::new(self, moment);
-                let pixels = (0..self.height).step_by(STRIDE).flat_map(|y| (0..self.width).step_by(STRIDE).map(move |x| (x, y)));
-                let mut met: Vec<(usize, usize)> = pixels.filter_map(|(x, y)| view.chart_at(x, y)).collect();
+                let moving = self.moving(moment.time_s);
+                let view = View::new(&moment.world_from_camera, &self.scene.solids, &moving);
+                let mut candidates = Vec::new();
+                let mut met = Vec::new();
+                for tile in &self.tiles {
+                    view.candidates(tile.low, tile.high, &mut candidates);
+                    for n in [self.rays[tile.y.start * self.width + tile.x.start], (tile.low + tile.high) * 0.5] {
+                        met.extend(view.first(n, &candidates).map(|first| {
+                            let item = &view.projected[first.item];
+                            let hit = item.origin + item.local_from_camera * n.extend(1.0) * first.depth_metres;
+                            (item.solid, view.solid(item.solid).shape.chart_point(hit).chart)
+                        }));
+                    }
+                }
                 met.sort_unstable();
                 met.dedup();
                 met
@@ -118,11 +134,6 @@ impl Renderer {
         seen.into_par_iter().with_max_len(1).for_each(|(solid, chart)| {
             self.surface(solid, chart);
         });
-    }
-
-    #[cfg(test)]
-    pub fn solids(&self) -> usize {
-        self.scene.solids.len()
     }
 
     fn solid(&self, index: usize) -> Primitive {
@@ -152,21 +163,36 @@ impl Renderer {
         })
     }
 
+    fn moving(&self, time_s: f64) -> Vec<Primitive> {
+        self.mover.as_ref().map(|m| m.at(time_s)).unwrap_or_default()
+    }
+
     /// Renders a moment; `smooth_edges` adds samples where surfaces meet.
     pub fn render(&self, moment: &Moment, smooth_edges: bool) -> Rendered {
-        let view = View::new(self, moment);
-        let (mut color, mut geometry) = (Vec::with_capacity(self.rays.len()), Vec::with_capacity(self.rays.len()));
-        for (x, y) in (0..self.height).flat_map(|y| (0..self.width).map(move |x| (x, y))) {
-            let (c, g) = view.look(x, y, moment.subpixel);
-            color.push(c);
-            geometry.push(g);
+        let moving = self.moving(moment.time_s);
+        let view = View::new(&moment.world_from_camera, &self.scene.solids, &moving);
+        let mut color = vec![Vec3::ZERO; self.rays.len()];
+        let mut geometry = vec![Geometry::default(); self.rays.len()];
+        let mut candidates = Vec::new();
+        for tile in &self.tiles {
+            view.candidates(tile.low, tile.high, &mut candidates);
+            for (x, y) in tile.pixels() {
+                (color[y * self.width + x], geometry[y * self.width + x]) = self.look(&view, x, y, moment.subpixel, &candidates);
+            }
         }
         if smooth_edges {
-            for (x, y) in (0..self.height).flat_map(|y| (0..self.width).map(move |x| (x, y))) {
-                if self.on_edge(&geometry, x, y) {
+            let mut edges = Vec::new();
+            for tile in &self.tiles {
+                edges.clear();
+                edges.extend(tile.pixels().filter(|(x, y)| self.on_edge(&geometry, *x, *y)));
+                if edges.is_empty() {
+                    continue;
+                }
+                view.candidates(tile.low, tile.high, &mut candidates);
+                for (x, y) in &edges {
+                    let look = |(u, v): &(f64, f64)| self.look(&view, *x, *y, DVec2::new(*u, *v), &candidates).0;
                     let i = y * self.width + x;
-                    let around = CORNERS.iter().map(|(u, v)| view.look(x, y, DVec2::new(*u, *v) * SUBPIXEL).0);
-                    color[i] = (color[i] + around.sum::<Vec3>()) / (CORNERS.len() + 1) as f32;
+                    color[i] = (color[i] + CORNERS.iter().map(look).sum::<Vec3>()) / (CORNERS.len() + 1) as f32;
                 }
             }
         }
@@ -181,104 +207,86 @@ impl Renderer {
             || (y > 0 && differs(i - self.width))
             || (y + 1 < self.height && differs(i + self.width))
     }
-}
 
-/// One moment's camera and moving solids.
-struct View<'a> {
-    renderer: &'a Renderer,
-    moving: Vec<Primitive>,
-    origin: DVec3,
-    world_from_camera: DMat3,
-}
-
-impl<'a> View<'a> {
-    fn new(renderer: &'a Renderer, moment: &Moment) -> Self {
-        let r = moment.world_from_camera.rotation.to_rotation_matrix();
-        let column = |k: usize| dvec3(r[(0, k)], r[(1, k)], r[(2, k)]);
-        Self {
-            renderer,
-            moving: renderer.mover.as_ref().map(|m| m.at(moment.time_s)).unwrap_or_default(),
-            origin: position(&moment.world_from_camera),
-            world_from_camera: DMat3::from_cols(column(0), column(1), column(2)),
-        }
-    }
-
-    /// Nearest surface along a ray of the camera: depth and solid.
-    fn nearest(&self, ray: &Ray) -> Option<(f64, usize)> {
-        let mut best = self.renderer.scene.nearest(ray)?;
-        for (k, solid) in self.moving.iter().enumerate() {
-            if let Some(t) = solid.intersect(ray).filter(|t| *t < best.0) {
-                best = (t, self.renderer.scene.solids.len() + k);
-            }
-        }
-        Some(best)
-    }
-
-    fn solid(&self, index: usize) -> &Primitive {
-        let still = &self.renderer.scene.solids;
-        if index < still.len() { &still[index] } else { &self.moving[index - still.len()] }
-    }
-
-    /// The directions of a pixel's ray and their change from one pixel to the next, right and down; z is 1 in the camera.
-    fn ray(&self, x: usize, y: usize, subpixel: DVec2) -> (Ray, DVec3, DVec3) {
-        let r = self.renderer;
-        let at = |x: usize, y: usize| r.rays[y * r.width + x];
-        let centre = at(x, y);
-        let dx = if x + 1 < r.width { at(x + 1, y) - centre } else { centre - at(x - 1, y) };
-        let dy = if y + 1 < r.height { at(x, y + 1) - centre } else { centre - at(x, y - 1) };
-        let n = centre + dx * subpixel.x + dy * subpixel.y;
-        let turn = |v: DVec3| self.world_from_camera * v;
-        (Ray { origin: self.origin, direction: turn(n.extend(1.0)) }, turn(dx.extend(0.0)), turn(dy.extend(0.0)))
-    }
-
-    fn chart_at(&self, x: usize, y: usize) -> Option<(usize, usize)> {
-        let (ray, ..) = self.ray(x, y, DVec2::ZERO);
-        let (t, index) = self.nearest(&ray)?;
-        let solid = self.solid(index);
-        Some((index, solid.shape.chart_point(solid.to_local(ray.origin + ray.direction * t)).chart))
+    /// A pixel's ray on the image plane, and its change from one pixel to the next, right and down.
+    fn ray(&self, x: usize, y: usize) -> (DVec2, DVec2, DVec2) {
+        let at = |x: usize, y: usize| self.rays[y * self.width + x];
+        let n = at(x, y);
+        let dx = if x + 1 < self.width { at(x + 1, y) - n } else { n - at(x - 1, y) };
+        let dy = if y + 1 < self.height { at(x, y + 1) - n } else { n - at(x, y - 1) };
+        (n, dx, dy)
     }
 
     /// Colour and geometry seen at a place in a pixel.
-    fn look(&self, x: usize, y: usize, subpixel: DVec2) -> (Vec3, Geometry) {
-        let (ray, dx, dy) = self.ray(x, y, subpixel);
-        let Some((t, index)) = self.nearest(&ray) else { return (Vec3::ZERO, Geometry::default()) };
-        let solid = self.solid(index);
-        let hit_in_world = ray.origin + ray.direction * t;
-        let hit = solid.shape.chart_point(solid.to_local(hit_in_world));
-        let local_from_world = solid.world_from_local.transpose();
-        let d = local_from_world * ray.direction;
+    fn look(&self, view: &View, x: usize, y: usize, subpixel: DVec2, candidates: &[u32]) -> (Vec3, Geometry) {
+        let (n, dx, dy) = self.ray(x, y);
+        let n = n + dx * subpixel.x + dy * subpixel.y;
+        let Some(met) = view.first(n, candidates) else { return (Vec3::ZERO, Geometry::default()) };
+        let item = &view.projected[met.item];
+        let solid = view.solid(item.solid);
+        let d = item.local_from_camera * n.extend(1.0);
+        let hit = solid.shape.chart_point(item.origin + d * met.depth_metres);
         let along = hit.normal.dot(d);
         // How the hit moves on the surface's tangent plane from one pixel to the next.
-        let step = |change: DVec3| {
-            let change = local_from_world * change;
-            let moved = (change - d * (hit.normal.dot(change) / along.min(-1e-3))) * t;
+        let step = |change: DVec2| {
+            let change = item.local_from_camera * change.extend(0.0);
+            let moved = (change - d * (hit.normal.dot(change) / along.min(-1e-3))) * met.depth_metres;
             DVec2::new(moved.dot(hit.along_u), moved.dot(hit.along_v))
         };
-        let mut color = self.renderer.surface(index, hit.chart).sample(hit.uv, step(dx), step(dy));
-        if self.renderer.gloss > 0.0 {
-            let normal = solid.world_from_local * hit.normal;
-            color += self.highlight(solid.material.gloss() * self.renderer.gloss, hit_in_world, normal, ray.direction);
+        let mut color = self.surface(item.solid, hit.chart).sample(hit.uv, step(dx), step(dy));
+        if self.gloss > 0.0 {
+            let strength = solid.material.gloss() * self.gloss;
+            color += self.highlight(strength, solid.to_world(hit.position), solid.world_from_local * hit.normal, view.origin);
         }
-        let facing = (-along / ray.direction.length()) as f32;
-        let geometry = Geometry { depth_metres: t as f32, facing, surface: (index * 8 + hit.chart) as u32 };
-        (color, geometry)
+        let facing = (-along / d.length()) as f32;
+        (color, Geometry { depth_metres: met.depth_metres as f32, facing, surface: (item.solid * 8 + hit.chart) as u32 })
     }
 
     /// Blinn-Phong highlights of the area lights, each taken as a point, shadowed.
-    fn highlight(&self, gloss: f32, p: DVec3, normal: DVec3, direction: DVec3) -> Vec3 {
+    fn highlight(&self, gloss: f32, p: DVec3, normal: DVec3, eye: DVec3) -> Vec3 {
         if gloss <= 0.0 {
             return Vec3::ZERO;
         }
         let seen = |light: &AreaLight| {
             let way = light.middle + light.normal * 1e-3 - p;
-            let half = (way.normalize() - direction.normalize()).normalize_or_zero();
+            let half = (way.normalize() + (eye - p).normalize()).normalize_or_zero();
             let strength = gloss * (half.dot(normal).max(0.0) as f32).powf(SHININESS);
             let ray = Ray { origin: p + normal * 1e-3, direction: way };
-            if strength < 1e-3 || way.dot(normal) <= 0.0 || self.renderer.scene.blocked(&ray, 1.0) {
+            if strength < 1e-3 || way.dot(normal) <= 0.0 || self.scene.blocked(&ray, 1.0) {
                 return Vec3::ZERO;
             }
-            light.radiance * self.renderer.lighting.exposure * (0.1 * strength)
+            light.radiance * self.lighting.exposure * (0.1 * strength)
         };
-        self.renderer.lights.iter().map(seen).sum()
+        self.lights.iter().map(seen).sum()
     }
+}
+
+/// A square of pixels and the rectangle of the image plane around its rays.
+struct Tile {
+    x: std::ops::Range<usize>,
+    y: std::ops::Range<usize>,
+    low: DVec2,
+    high: DVec2,
+}
+
+impl Tile {
+    fn pixels(&self) -> impl Iterator<Item = (usize, usize)> + '_ {
+        self.y.clone().flat_map(|y| self.x.clone().map(move |x| (x, y)))
+    }
+}
+
+/// Cuts the image into tiles; their rectangles reach a pixel further, for samples beside the centres.
+fn tiles(width: usize, height: usize, rays: &[DVec2]) -> Vec<Tile> {
+    let corners = (0..height).step_by(TILE).flat_map(|y| (0..width).step_by(TILE).map(move |x| (x, y)));
+    let tile = |(x, y): (usize, usize)| {
+        let mut tile =
+            Tile { x: x..(x + TILE).min(width), y: y..(y + TILE).min(height), low: DVec2::INFINITY, high: DVec2::NEG_INFINITY };
+        for ray in tile.pixels().map(|(x, y)| rays[y * width + x]).collect::<Vec<_>>() {
+            (tile.low, tile.high) = (tile.low.min(ray), tile.high.max(ray));
+        }
+        let pixel = (tile.high - tile.low) / (TILE.min(width).min(height) - 1) as f64;
+        (tile.low, tile.high) = (tile.low - 2.0 * pixel, tile.high + 2.0 * pixel);
+        tile
+    };
+    corners.map(tile).collect()
 }

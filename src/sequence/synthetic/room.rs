@@ -280,7 +280,7 @@ pub fn radiance(material: &Material) -> Option<Vec3> {
     match material {
         Material::LightPanel => Some(Vec3::new(6.0, 5.6, 4.9)),
         Material::Window => Some(Vec3::new(2.6, 3.0, 3.4)),
-        Material::Lampshade => Some(Vec3::new(5.0, 3.6, 2.0)),
+        Material::Lampshade => Some(Vec3::new(2.4, 1.8, 1.1)),
         _ => None,
     }
 }

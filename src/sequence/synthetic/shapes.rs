@@ -92,6 +92,14 @@ impl Shape {
         }
     }
 
+    /// Where a ray in the solid's frame first meets the surface from its visible side.
+    #[inline]
+    pub fn intersect(&self, ray: &Ray) -> Option<f64> {
+        let (near, far) = self.interval(ray.origin, ray.direction)?;
+        let t = if matches!(self, Self::Shell { .. }) { far } else { near };
+        (t > MIN_T).then_some(t)
+    }
+
     /// The interval of a local ray inside the solid.
     #[inline]
     fn interval(&self, o: DVec3, d: DVec3) -> Option<(f64, f64)> {
@@ -207,13 +215,24 @@ fn slab(o: f64, d: f64, half: f64) -> (f64, f64) {
     }
     let inverse = 1.0 / d;
     let (a, b) = ((-half - o) * inverse, (half - o) * inverse);
-    (a.min(b), a.max(b))
+    if a < b { (a, b) } else { (b, a) }
+}
+
+/// `f64::min` and `max` take care of NaN, which costs more than all the rest here.
+#[inline]
+pub fn smaller(a: f64, b: f64) -> f64 {
+    if a < b { a } else { b }
+}
+
+#[inline]
+pub fn larger(a: f64, b: f64) -> f64 {
+    if a > b { a } else { b }
 }
 
 #[inline]
 fn slabs(o: DVec3, d: DVec3, half: DVec3) -> Option<(f64, f64)> {
     let (x, y, z) = (slab(o.x, d.x, half.x), slab(o.y, d.y, half.y), slab(o.z, d.z, half.z));
-    let (near, far) = (x.0.max(y.0).max(z.0), x.1.min(y.1).min(z.1));
+    let (near, far) = (larger(larger(x.0, y.0), z.0), smaller(smaller(x.1, y.1), z.1));
     (near <= far).then_some((near, far))
 }
 
@@ -234,13 +253,10 @@ fn ball(o: DVec3, d: DVec3, radius: f64) -> Option<(f64, f64)> {
 }
 
 impl Primitive {
-    /// Where the ray first meets the surface from its visible side.
-    #[inline]
+    /// Where a ray in the world first meets the surface from its visible side.
     pub fn intersect(&self, ray: &Ray) -> Option<f64> {
-        let local_from_world = self.world_from_local.transpose();
-        let (near, far) = self.shape.interval(local_from_world * (ray.origin - self.centre), local_from_world * ray.direction)?;
-        let t = if matches!(self.shape, Shape::Shell { .. }) { far } else { near };
-        (t > MIN_T).then_some(t)
+        let direction = self.world_from_local.transpose() * ray.direction;
+        self.shape.intersect(&Ray { origin: self.to_local(ray.origin), direction })
     }
 
     pub fn to_local(&self, p_in_world: DVec3) -> DVec3 {

@@ -3,20 +3,23 @@
 //! Since light and texture do not depend on the viewer, both are computed once per texel; a pixel then averages the texels under
 //! its footprint (trilinear, several taps along the longer axis), which keeps fine texture from aliasing.
 
-use glam::{DVec2, Vec2, Vec3};
+use glam::{DVec2, Vec2, Vec3, Vec4};
 
 /// Linear radiance of the highest stored value.
 const FULL_SCALE: f32 = 2.0;
 /// Most look-ups along a stretched footprint.
-const MAX_TAPS: f32 = 5.0;
+const MAX_TAPS: f32 = 4.0;
 /// Most texels along a side; larger charts get coarser texels.
 const MAX_SIDE: f64 = 6000.0;
+
+/// Whole texels by which look-ups may leave a chart to the left or below before they are clipped.
+const OFFSET: f32 = 64.0;
 
 struct Level {
     width: usize,
     height: usize,
-    /// Row-major, linear, `FULL_SCALE` at 65535.
-    texels: Vec<[u16; 3]>,
+    /// Row-major, linear, `FULL_SCALE` at 65535; the fourth is there for the width of a register.
+    texels: Vec<[u16; 4]>,
 }
 
 pub struct Surface {
@@ -50,15 +53,16 @@ impl Surface {
         let length = major.length().max(1e-6);
         let taps = (length * length / area.max(1e-9)).round().clamp(1.0, MAX_TAPS);
         let width = (area / length).max(length / taps);
-        let level = width.max(1.0).log2();
-        let mut sum = Vec3::ZERO;
+        let level = rough_log2(width.max(1.0));
+        let mut sum = Vec4::ZERO;
         for tap in 0..taps as u32 {
             sum += self.trilinear(at + major * ((tap as f32 + 0.5) / taps - 0.5), level);
         }
-        sum / taps
+        (sum * (FULL_SCALE / 65535.0 / taps)).truncate()
     }
 
-    fn trilinear(&self, at: Vec2, level: f32) -> Vec3 {
+    #[inline]
+    fn trilinear(&self, at: Vec2, level: f32) -> Vec4 {
         let last = self.levels.len() - 1;
         let low = (level as usize).min(last);
         let blend = level - low as f32;
@@ -76,18 +80,20 @@ impl Surface {
 }
 
 impl Level {
-    fn bilinear(&self, at: Vec2, wraps: bool) -> Vec3 {
-        let p = at - 0.5;
-        let cell = p.floor();
-        let f = p - cell;
-        let (x, y) = (cell.x as i32, cell.y as i32);
+    #[inline]
+    fn bilinear(&self, at: Vec2, wraps: bool) -> Vec4 {
+        // Floors by casts of non-negative numbers, since `floor` is a call on plain x86-64.
+        let p = at.max(Vec2::splat(0.5 - OFFSET)) + (OFFSET - 0.5);
+        let (x, y) = (p.x as i32, p.y as i32);
+        let f = Vec2::new(p.x - x as f32, p.y - y as f32);
+        let (x, y) = (x - OFFSET as i32, y - OFFSET as i32);
         let column = |x: i32| if wraps { x.rem_euclid(self.width as i32) } else { x.clamp(0, self.width as i32 - 1) } as usize;
         let row = |y: i32| y.clamp(0, self.height as i32 - 1) as usize * self.width;
         let (x0, x1, y0, y1) = (column(x), column(x + 1), row(y), row(y + 1));
-        let fetch = |i: usize| Vec3::from(self.texels[i].map(f32::from));
+        let fetch = |i: usize| Vec4::from(self.texels[i].map(|v| i32::from(v) as f32));
         let bottom = fetch(y0 + x0).lerp(fetch(y0 + x1), f.x);
         let top = fetch(y1 + x0).lerp(fetch(y1 + x1), f.x);
-        bottom.lerp(top, f.y) * (FULL_SCALE / 65535.0)
+        bottom.lerp(top, f.y)
     }
 
     /// The next level: each texel the mean of the four (or fewer) under it.
@@ -111,8 +117,14 @@ impl Level {
     }
 }
 
-fn encode(radiance: Vec3) -> [u16; 3] {
-    (radiance.clamp(Vec3::ZERO, Vec3::splat(FULL_SCALE)) * (65535.0 / FULL_SCALE) + 0.5).to_array().map(|v| v as u16)
+/// The logarithm to base 2 with a straight line between powers of two, which is also how levels are blended.
+fn rough_log2(v: f32) -> f32 {
+    let bits = v.to_bits();
+    ((bits >> 23) as f32 - 127.0) + (bits & 0x7F_FFFF) as f32 / 8_388_608.0
+}
+
+fn encode(radiance: Vec3) -> [u16; 4] {
+    (radiance.extend(0.0).clamp(Vec4::ZERO, Vec4::splat(FULL_SCALE)) * (65535.0 / FULL_SCALE) + 0.5).to_array().map(|v| v as u16)
 }
 
 #[cfg(test)]

@@ -122,7 +122,7 @@ impl Material {
 /// A muted colour at random, as furniture and book covers have it.
 pub fn muted(seed: u32) -> Vec3 {
     let pick = |salt| unit(3, 7, seed ^ salt);
-    hsv(pick(0x11), 0.25 + 0.45 * pick(0x22), 0.35 + 0.45 * pick(0x33))
+    hsv(pick(0x11), 0.14 + 0.34 * pick(0x22), 0.36 + 0.46 * pick(0x33))
 }
 
 /// 1 within `half` of a line at 0, falling to 0 over the last fifth.

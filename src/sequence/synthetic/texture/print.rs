@@ -78,7 +78,7 @@ pub fn poster(place: &Place, seed: u32) -> Vec3 {
         return Vec3::splat(0.88) * (0.95 + 0.08 * octaves(p * 200.0, 2, seed));
     }
     let hue = pick(1);
-    let ground = hsv(hue, 0.35 + 0.3 * pick(2), 0.55 + 0.35 * pick(3));
+    let ground = hsv(hue, 0.18 + 0.26 * pick(2), 0.6 + 0.3 * pick(3));
     let mut seen = ground * (0.9 + 0.18 * octaves(p * 14.0, 4, seed));
     for k in 0..9 {
         let salt = seed ^ (k as u32 * 7919);
@@ -94,7 +94,7 @@ pub fn poster(place: &Place, seed: u32) -> Vec3 {
             _ => line(q.length() - extent, extent * 0.18),
         };
         let stripes = if r(6) > 0.6 { 0.75 + 0.25 * ((q.x / 0.012).sin()).signum() } else { 1.0 };
-        let color = hsv(hue + 0.15 + 0.6 * r(5), 0.65, 0.3 + 0.6 * r(7)) * stripes;
+        let color = hsv(hue + 0.15 + 0.6 * r(5), 0.42, 0.3 + 0.6 * r(7)) * stripes;
         seen = seen.lerp(color, inside * 0.92);
     }
     let headline =
@@ -205,7 +205,7 @@ pub fn window(place: &Place, seed: u32) -> Vec3 {
     let (crown, tag) = spots(p * 22.0, 0.7, seed ^ 4);
     let foliage = Vec3::new(0.30, 0.45, 0.22) * (0.6 + 0.6 * octaves(p * 60.0, 3, seed ^ 5)) * (0.8 + 0.4 * crown * tag);
     seen = seen.lerp(foliage, 1.0 - ramp(crest - 0.01, crest + 0.01, q.y));
-    let (flower, hue) = spots(p * 40.0, 0.3, seed ^ 6);
+    let (flower, hue) = spots(p * 40.0, 0.22, seed ^ 6);
     let meadow =
         (Vec3::new(0.52, 0.64, 0.30) * (0.7 + 0.5 * octaves(p * 45.0, 4, seed ^ 7))).lerp(hsv(hue, 0.4, 0.95), flower * 0.8);
     seen.lerp(meadow, 1.0 - ramp(0.26, 0.27, q.y))
