@@ -107,8 +107,8 @@ pub fn replay(config: &Config, out: PathBuf, stop: Arc<AtomicBool>, verbosity: V
         out.display()
     );
     let windows = Progress { stop, ..Progress::default() };
+    let done = AtomicBool::new(false);
     let mut outcome = std::thread::scope(|scope| {
-        let done = AtomicBool::new(false);
         let (windows, done) = (&windows, &done);
         let bar = progress::bar(verbosity, sequence.entries.len() as u64, "{wide_bar} {pos}/{len} frames  {msg}");
         scope.spawn(move || show(windows, &bar, done));
