@@ -1,15 +1,6 @@
 // Photometric and depth loss of a rendered view, and what the backward pass needs of SSIM: its partial derivatives by the local mean,
 // mean square and mean product. L = (1-λ)·L1 + λ·(1-SSIM) + λ_depth·|Σ w z - (1-T)·sensor depth|, means over the image.
 
-struct LossSetup {
-    width: u32,
-    height: u32,
-    // λ: share of SSIM.
-    ssim_weight: f32,
-    // λ_depth per metre; 0 without depth.
-    depth_weight: f32,
-}
-
 @group(0) @binding(0) var<uniform> setup: LossSetup;
 // [H, W] rendered (r, g, b, Σ w z); (transmittance, -).
 @group(0) @binding(1) var<storage, read> color_depth: array<vec4<f32>>;
@@ -17,7 +8,7 @@ struct LossSetup {
 // [H, W] the keyframe: 8-bit RGBA, and sensor depth in metres (0: not measured).
 @group(0) @binding(3) var<storage, read> target_color: array<u32>;
 @group(0) @binding(4) var<storage, read> target_depth: array<f32>;
-// [3, H, W] ∂SSIM/∂(mean, mean square, mean product) per channel.
+// [3 channels, H, W] ∂SSIM/∂(mean, mean square, mean product).
 @group(0) @binding(5) var<storage, read_write> partials: array<vec4<f32>>;
 // [workgroups] sums of |colour error|, SSIM, |depth error|, squared colour error.
 @group(0) @binding(6) var<storage, read_write> loss_sums: array<vec4<f32>>;
@@ -26,61 +17,73 @@ const C1: f32 = 0.0001;
 const C2: f32 = 0.0009;
 
 var<workgroup> source: array<vec2<f32>, 676>;
-// Row-filtered x, y, x², y², xy: [26 rows, 16 columns].
+// Row-filtered means (x, y), squares (x², y²) and products xy: [26 rows, 16 columns].
 var<workgroup> rows_means: array<vec2<f32>, 416>;
 var<workgroup> rows_squares: array<vec2<f32>, 416>;
 var<workgroup> rows_product: array<f32, 416>;
-var<workgroup> sums: array<vec4<f32>, 256>;
+var<workgroup> sums: array<vec4<f32>, 64>;
 
-struct Ssim {
-    value: f32,
-    by_mean: f32,
-    by_square: f32,
-    by_product: f32,
+// Filtered values of four outputs.
+struct Moments {
+    mean_x: vec4<f32>,
+    mean_y: vec4<f32>,
+    square_x: vec4<f32>,
+    square_y: vec4<f32>,
+    product: vec4<f32>,
 }
 
-@compute @workgroup_size(16, 16)
+struct Ssim {
+    value: vec4<f32>,
+    by_mean: vec4<f32>,
+    by_square: vec4<f32>,
+    by_product: vec4<f32>,
+}
+
+@compute @workgroup_size(64)
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_id) at: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
 ) {
-    let pixel = workgroup.xy * 16u + at.xy;
-    let inside = pixel.x < setup.width && pixel.y < setup.height;
-    let index = pixel.y * setup.width + pixel.x;
-    var by_mean = vec4(0.0);
-    var by_square = vec4(0.0);
-    var by_product = vec4(0.0);
+    // Four pixels of one column.
+    let column = local % 16u;
+    let row = local / 16u * 4u;
+    let x = workgroup.x * 16u + column;
+    let y = workgroup.y * 16u + row;
+    let pixels = setup.width * setup.height;
     var sum = vec4(0.0);
+    let inside = select(vec4(0.0), vec4(1.0), (vec4(y) + vec4(0u, 1u, 2u, 3u) < vec4(setup.height)) & vec4(x < setup.width));
     for (var channel = 0u; channel < 3u; channel++) {
+        workgroupBarrier();
         load_tile(workgroup.xy, channel, local);
         workgroupBarrier();
-        let own = source[(at.y + RADIUS) * SPAN + at.x + RADIUS];
-        filter_rows(local);
-        workgroupBarrier();
-        if inside {
-            let ssim = filter_columns(at.xy);
-            by_mean[channel] = ssim.by_mean;
-            by_square[channel] = ssim.by_square;
-            by_product[channel] = ssim.by_product;
-            let error = own.x - own.y;
-            sum += vec4(abs(error), ssim.value, 0.0, error * error);
+        for (var item = local; item < SPAN * 4u; item += 64u) {
+            filter_row(item / 4u, item % 4u * 4u);
         }
         workgroupBarrier();
+        let ssim = ssim_of(filter_column(column, row));
+        let own = (row + RADIUS) * SPAN + column + RADIUS;
+        for (var k = 0u; k < 4u; k++) {
+            if inside[k] > 0.0 {
+                let to = channel * pixels + (y + k) * setup.width + x;
+                partials[to] = vec4(ssim.by_mean[k], ssim.by_square[k], ssim.by_product[k], 0.0);
+            }
+            let pair = source[own + k * SPAN];
+            let error = pair.x - pair.y;
+            sum += inside[k] * vec4(abs(error), ssim.value[k], 0.0, error * error);
+        }
     }
-    if inside {
-        let pixels = setup.width * setup.height;
-        partials[index] = by_mean;
-        partials[pixels + index] = by_square;
-        partials[2u * pixels + index] = by_product;
-        let measured = target_depth[index];
-        if setup.depth_weight > 0.0 && measured > 0.0 {
-            sum.z = abs(color_depth[index].w - (1.0 - state[index].x) * measured);
+    for (var k = 0u; k < 4u; k++) {
+        if inside[k] > 0.0 {
+            let index = (y + k) * setup.width + x;
+            let measured = target_depth[index];
+            if setup.depth_weight > 0.0 && measured > 0.0 {
+                sum.z += abs(color_depth[index].w - (1.0 - state[index].x) * measured);
+            }
         }
     }
     sums[local] = sum;
-    for (var stride = 128u; stride > 0u; stride /= 2u) {
+    for (var stride = 32u; stride > 0u; stride /= 2u) {
         workgroupBarrier();
         if local < stride {
             sums[local] += sums[local + stride];
@@ -92,7 +95,7 @@ fn main(
 }
 
 fn load_tile(workgroup: vec2<u32>, channel: u32, local: u32) {
-    for (var k = local; k < SPAN * SPAN; k += 256u) {
+    for (var k = local; k < SPAN * SPAN; k += 64u) {
         let pixel = vec2<i32>(workgroup * 16u + vec2(k % SPAN, k / SPAN)) - i32(RADIUS);
         var value = vec2(0.0);
         if all(pixel >= vec2(0)) && pixel.x < i32(setup.width) && pixel.y < i32(setup.height) {
@@ -103,50 +106,85 @@ fn load_tile(workgroup: vec2<u32>, channel: u32, local: u32) {
     }
 }
 
-fn filter_rows(local: u32) {
-    for (var k = local; k < 416u; k += 256u) {
-        let first = (k / 16u) * SPAN + k % 16u;
-        var means = vec2(0.0);
-        var squares = vec2(0.0);
-        var product = 0.0;
-        for (var tap = 0u; tap < 11u; tap++) {
-            let value = source[first + tap];
-            let weighted = WINDOW[tap] * value;
-            means += weighted;
-            squares += weighted * value;
-            product += weighted.x * value.y;
-        }
-        rows_means[k] = means;
-        rows_squares[k] = squares;
-        rows_product[k] = product;
+fn add_source(m: ptr<function, Moments>, value: vec2<f32>, taps: vec4<f32>) {
+    let x = taps * value.x;
+    let y = taps * value.y;
+    (*m).mean_x += x;
+    (*m).mean_y += y;
+    (*m).square_x += x * value.x;
+    (*m).square_y += y * value.y;
+    (*m).product += x * value.y;
+}
+
+// Four outputs of one row, from column `first` of the tile on.
+fn filter_row(row: u32, first: u32) {
+    let at = row * SPAN + first;
+    var m: Moments;
+    add_source(&m, source[at], T0);
+    add_source(&m, source[at + 1u], T1);
+    add_source(&m, source[at + 2u], T2);
+    add_source(&m, source[at + 3u], T3);
+    add_source(&m, source[at + 4u], T4);
+    add_source(&m, source[at + 5u], T5);
+    add_source(&m, source[at + 6u], T6);
+    add_source(&m, source[at + 7u], T7);
+    add_source(&m, source[at + 8u], T8);
+    add_source(&m, source[at + 9u], T9);
+    add_source(&m, source[at + 10u], T10);
+    add_source(&m, source[at + 11u], T11);
+    add_source(&m, source[at + 12u], T12);
+    add_source(&m, source[at + 13u], T13);
+    for (var k = 0u; k < 4u; k++) {
+        let to = row * 16u + first + k;
+        rows_means[to] = vec2(m.mean_x[k], m.mean_y[k]);
+        rows_squares[to] = vec2(m.square_x[k], m.square_y[k]);
+        rows_product[to] = m.product[k];
     }
 }
 
-fn filter_columns(at: vec2<u32>) -> Ssim {
-    var means = vec2(0.0);
-    var squares = vec2(0.0);
-    var product = 0.0;
-    for (var tap = 0u; tap < 11u; tap++) {
-        let k = (at.y + tap) * 16u + at.x;
-        means += WINDOW[tap] * rows_means[k];
-        squares += WINDOW[tap] * rows_squares[k];
-        product += WINDOW[tap] * rows_product[k];
-    }
-    return ssim_of(means, squares, product);
+fn add_row(m: ptr<function, Moments>, at: u32, taps: vec4<f32>) {
+    let means = rows_means[at];
+    let squares = rows_squares[at];
+    (*m).mean_x += taps * means.x;
+    (*m).mean_y += taps * means.y;
+    (*m).square_x += taps * squares.x;
+    (*m).square_y += taps * squares.y;
+    (*m).product += taps * rows_product[at];
 }
 
-fn ssim_of(means: vec2<f32>, squares: vec2<f32>, product: f32) -> Ssim {
+// Four outputs of one column, from row `first` of the tile on.
+fn filter_column(column: u32, first: u32) -> Moments {
+    let at = first * 16u + column;
+    var m: Moments;
+    add_row(&m, at, T0);
+    add_row(&m, at + 16u, T1);
+    add_row(&m, at + 32u, T2);
+    add_row(&m, at + 48u, T3);
+    add_row(&m, at + 64u, T4);
+    add_row(&m, at + 80u, T5);
+    add_row(&m, at + 96u, T6);
+    add_row(&m, at + 112u, T7);
+    add_row(&m, at + 128u, T8);
+    add_row(&m, at + 144u, T9);
+    add_row(&m, at + 160u, T10);
+    add_row(&m, at + 176u, T11);
+    add_row(&m, at + 192u, T12);
+    add_row(&m, at + 208u, T13);
+    return m;
+}
+
+fn ssim_of(m: Moments) -> Ssim {
     // Rounding can make a variance negative; it is then a constant 0.
-    let raw = squares - means * means;
-    let variance = max(raw, vec2(0.0));
-    let free = select(0.0, 1.0, raw.x > 0.0);
-    let a1 = 2.0 * means.x * means.y + C1;
-    let a2 = 2.0 * (product - means.x * means.y) + C2;
-    let b1 = means.x * means.x + means.y * means.y + C1;
-    let b2 = variance.x + variance.y + C2;
-    let value = a1 * a2 / (b1 * b2);
-    let by_variance = -value / b2 * free;
-    let by_covariance = 2.0 * a1 / (b1 * b2);
-    let by_mean = 2.0 * means.y * a2 / (b1 * b2) - 2.0 * means.x * value / b1 - 2.0 * means.x * by_variance - means.y * by_covariance;
+    let raw = m.square_x - m.mean_x * m.mean_x;
+    let variances = max(raw, vec4(0.0)) + max(m.square_y - m.mean_y * m.mean_y, vec4(0.0));
+    let free = select(vec4(0.0), vec4(1.0), raw > vec4(0.0));
+    let a1 = 2.0 * m.mean_x * m.mean_y + C1;
+    let a2 = 2.0 * (m.product - m.mean_x * m.mean_y) + C2;
+    let b1 = 1.0 / (m.mean_x * m.mean_x + m.mean_y * m.mean_y + C1);
+    let b2 = 1.0 / (variances + C2);
+    let value = a1 * a2 * b1 * b2;
+    let by_variance = -value * b2 * free;
+    let by_covariance = 2.0 * a1 * b1 * b2;
+    let by_mean = 2.0 * m.mean_y * a2 * b1 * b2 - 2.0 * m.mean_x * (value * b1 + by_variance) - m.mean_y * by_covariance;
     return Ssim(value, by_mean, by_variance, by_covariance);
 }

@@ -17,13 +17,14 @@
 // [pairs, 3] (Σ w g_rgb, Σ w g_depth), (Σ q, Σ q dx, Σ q dy, 0), (Σ q dx², Σ q dx dy, Σ q dy², 0), q = ∂L/∂power.
 @group(0) @binding(8) var<storage, read_write> pair_gradients: array<vec4<f32>>;
 
-const BATCH: u32 = 64u;
-const CHUNK: u32 = 4u;
+const CHUNK: u32 = 8u;
+const MASK_WORDS: u32 = (TILE_THREADS + 31u) / 32u;
 var<workgroup> batch_mean: array<vec4<f32>, BATCH>;
 var<workgroup> batch_conic: array<vec4<f32>, BATCH>;
 var<workgroup> batch_color: array<vec4<f32>, BATCH>;
-// [CHUNK, 3, 64] what each invocation adds to each pair of the chunk.
-var<workgroup> partial: array<vec4<f32>, 768>;
+// [CHUNK, 3, TILE_THREADS] what each invocation adds to each pair of the chunk, and [CHUNK, MASK_WORDS] which of them add anything.
+var<workgroup> partial: array<vec4<f32>, CHUNK * 3u * TILE_THREADS>;
+var<workgroup> touched: array<atomic<u32>, CHUNK * MASK_WORDS>;
 var<workgroup> tile_last: atomic<u32>;
 
 struct PixelState {
@@ -37,13 +38,7 @@ struct PixelState {
     depth: vec4<f32>,
 }
 
-struct PairSums {
-    color_depth: vec4<f32>,
-    first_moments: vec4<f32>,
-    second_moments: vec4<f32>,
-}
-
-@compute @workgroup_size(64)
+@compute @workgroup_size(TILE_THREADS)
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
@@ -69,25 +64,22 @@ fn main(
         for (var chunk = 0u; chunk < end; chunk += CHUNK) {
             let count = min(CHUNK, end - chunk);
             for (var k = 0u; k < count; k++) {
-                let sums = blend_backward(chunk + k, start + chunk + k - range.x, quad, &pixels);
-                partial[(k * 3u) * 64u + local] = sums.color_depth;
-                partial[(k * 3u + 1u) * 64u + local] = sums.first_moments;
-                partial[(k * 3u + 2u) * 64u + local] = sums.second_moments;
+                blend_backward(k, chunk + k, start + chunk + k - range.x, quad, local, &pixels);
             }
             workgroupBarrier();
             if local < count * 3u {
-                var sum = vec4(0.0);
-                for (var i = 0u; i < 64u; i++) {
-                    sum += partial[local * 64u + i];
-                }
                 let slot = sorted_slots[start + chunk + local / 3u];
-                pair_gradients[slot * 3u + local % 3u] = sum;
+                pair_gradients[slot * 3u + local % 3u] = sum_touched(local);
+            }
+            workgroupBarrier();
+            if local < CHUNK * MASK_WORDS {
+                atomicStore(&touched[local], 0u);
             }
             workgroupBarrier();
         }
     }
     // Pairs behind every pixel's last contributor were not blended.
-    for (var i = blended_end + local; i < range.y; i += 64u) {
+    for (var i = blended_end + local; i < range.y; i += TILE_THREADS) {
         let slot = sorted_slots[i];
         pair_gradients[slot * 3u] = vec4(0.0);
         pair_gradients[slot * 3u + 1u] = vec4(0.0);
@@ -119,27 +111,39 @@ fn load_pixels(quad: Quad) -> PixelState {
 }
 
 fn load_batch(start: u32, end: u32, local: u32) {
-    let i = start + local;
-    if i < end {
-        let gaussian = slot_gaussians[sorted_slots[i]];
-        batch_mean[local] = projected[gaussian];
-        batch_conic[local] = projected[view.capacity + gaussian];
-        batch_color[local] = projected[2u * view.capacity + gaussian];
+    for (var k = local; k < min(BATCH, end - start); k += TILE_THREADS) {
+        let gaussian = slot_gaussians[sorted_slots[start + k]];
+        batch_mean[k] = projected[gaussian];
+        batch_conic[k] = projected[view.capacity + gaussian];
+        batch_color[k] = projected[2u * view.capacity + gaussian];
     }
 }
 
-// One Gaussian over this invocation's pixels; `position` counts from the start of the tile's list.
-fn blend_backward(k: u32, position: u32, quad: Quad, pixels: ptr<function, PixelState>) -> PairSums {
-    let mean = batch_mean[k];
-    let conic = batch_conic[k];
+// Sum over the invocations that touched a pair, in their order; `item` counts [CHUNK, 3].
+fn sum_touched(item: u32) -> vec4<f32> {
+    var sum = vec4(0.0);
+    for (var word = 0u; word < MASK_WORDS; word++) {
+        var mask = atomicLoad(&touched[item / 3u * MASK_WORDS + word]);
+        while mask != 0u {
+            sum += partial[item * TILE_THREADS + word * 32u + firstTrailingBit(mask)];
+            mask &= mask - 1u;
+        }
+    }
+    return sum;
+}
+
+// One Gaussian, number `k` of the chunk, over this invocation's pixels; `position` counts from the start of the tile's list.
+fn blend_backward(k: u32, in_batch: u32, position: u32, quad: Quad, local: u32, pixels: ptr<function, PixelState>) {
+    let mean = batch_mean[in_batch];
+    let conic = batch_conic[in_batch];
     let power = exponent(mean.xy, conic.xyz, quad);
     let hit = (power + mean.w >= vec4(0.0)) & (vec4(position) < (*pixels).last);
     if !any(hit) {
-        return PairSums(vec4(0.0), vec4(0.0), vec4(0.0));
+        return;
     }
     let unbounded = conic.w * exp(min(power, vec4(0.0)));
     let alpha = select(vec4(0.0), min(vec4(ALPHA_MAX), unbounded), hit);
-    let color = batch_color[k];
+    let color = batch_color[in_batch];
     let value = (*pixels).red * color.x + (*pixels).green * color.y + (*pixels).blue * color.z + (*pixels).depth * mean.z;
     let weight = alpha * (*pixels).transmittance;
     (*pixels).behind -= weight * value;
@@ -152,9 +156,9 @@ fn blend_backward(k: u32, position: u32, quad: Quad, pixels: ptr<function, Pixel
     let qx = q * dx;
     let qy = q * dy;
     let ones = vec4(1.0);
-    return PairSums(
-        vec4(dot(weight, (*pixels).red), dot(weight, (*pixels).green), dot(weight, (*pixels).blue), dot(weight, (*pixels).depth)),
-        vec4(dot(q, ones), dot(qx, ones), dot(qy, ones), 0.0),
-        vec4(dot(qx, dx), dot(qx, dy), dot(qy, dy), 0.0),
-    );
+    let to = k * 3u * TILE_THREADS + local;
+    partial[to] = vec4(dot(weight, (*pixels).red), dot(weight, (*pixels).green), dot(weight, (*pixels).blue), dot(weight, (*pixels).depth));
+    partial[to + TILE_THREADS] = vec4(dot(q, ones), dot(qx, ones), dot(qy, ones), 0.0);
+    partial[to + 2u * TILE_THREADS] = vec4(dot(qx, dx), dot(qx, dy), dot(qy, dy), 0.0);
+    atomicOr(&touched[k * MASK_WORDS + local / 32u], 1u << (local % 32u));
 }

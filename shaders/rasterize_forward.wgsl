@@ -11,13 +11,12 @@
 // [H, W] (transmittance, pairs of the tile's list up to and with the last one blended).
 @group(0) @binding(6) var<storage, read_write> state: array<vec2<f32>>;
 
-const BATCH: u32 = 64u;
 var<workgroup> batch_mean: array<vec4<f32>, BATCH>;
 var<workgroup> batch_conic: array<vec4<f32>, BATCH>;
 var<workgroup> batch_color: array<vec4<f32>, BATCH>;
 var<workgroup> finished: atomic<u32>;
 
-@compute @workgroup_size(64)
+@compute @workgroup_size(TILE_THREADS)
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
@@ -44,7 +43,7 @@ fn main(
             atomicAdd(&finished, 1u);
         }
         workgroupBarrier();
-        if workgroupUniformLoad(&finished) == 64u {
+        if workgroupUniformLoad(&finished) == TILE_THREADS {
             break;
         }
         load_batch(start, range.y, local);
@@ -83,11 +82,10 @@ fn main(
 }
 
 fn load_batch(start: u32, end: u32, local: u32) {
-    let i = start + local;
-    if i < end {
-        let gaussian = slot_gaussians[sorted_slots[i]];
-        batch_mean[local] = projected[gaussian];
-        batch_conic[local] = projected[view.capacity + gaussian];
-        batch_color[local] = projected[2u * view.capacity + gaussian];
+    for (var k = local; k < min(BATCH, end - start); k += TILE_THREADS) {
+        let gaussian = slot_gaussians[sorted_slots[start + k]];
+        batch_mean[k] = projected[gaussian];
+        batch_conic[k] = projected[view.capacity + gaussian];
+        batch_color[k] = projected[2u * view.capacity + gaussian];
     }
 }

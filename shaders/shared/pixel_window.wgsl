@@ -1,7 +1,37 @@
 // The 11-tap Gaussian window (σ = 1.5 pixels) of SSIM (Wang et al. 2004), zero beyond the image, and the tiling that both loss
-// passes share: a workgroup of 16×16 with a border of 5.
+// passes share: a workgroup of 64 covers 16×16 pixels with a border of 5. Each invocation filters four outputs side by side, so that an
+// input is loaded once for all four.
 const RADIUS: u32 = 5u;
 const SPAN: u32 = 26u;
-const WINDOW = array<f32, 11>(
-    0.00102838, 0.00759876, 0.03600077, 0.10936069, 0.21300553, 0.26601172, 0.21300553, 0.10936069, 0.03600077, 0.00759876, 0.00102838,
-);
+const W0: f32 = 0.00102838;
+const W1: f32 = 0.00759876;
+const W2: f32 = 0.03600077;
+const W3: f32 = 0.10936069;
+const W4: f32 = 0.21300553;
+const W5: f32 = 0.26601172;
+
+// Weights of 14 successive inputs for the four outputs.
+const T0 = vec4(W0, 0.0, 0.0, 0.0);
+const T1 = vec4(W1, W0, 0.0, 0.0);
+const T2 = vec4(W2, W1, W0, 0.0);
+const T3 = vec4(W3, W2, W1, W0);
+const T4 = vec4(W4, W3, W2, W1);
+const T5 = vec4(W5, W4, W3, W2);
+const T6 = vec4(W4, W5, W4, W3);
+const T7 = vec4(W3, W4, W5, W4);
+const T8 = vec4(W2, W3, W4, W5);
+const T9 = vec4(W1, W2, W3, W4);
+const T10 = vec4(W0, W1, W2, W3);
+const T11 = vec4(0.0, W0, W1, W2);
+const T12 = vec4(0.0, 0.0, W0, W1);
+const T13 = vec4(0.0, 0.0, 0.0, W0);
+
+// What every part of the loss is told; host twin: `optimise::loss::LossSetup`.
+struct LossSetup {
+    width: u32,
+    height: u32,
+    // λ: share of SSIM.
+    ssim_weight: f32,
+    // λ_depth per metre; 0 without depth.
+    depth_weight: f32,
+}

@@ -1,4 +1,7 @@
-// How a workgroup of 64 invocations covers a tile: each takes PIXELS_PER_THREAD = 4 pixels, a 2×2 quad, held as the lanes of a vec4.
+// How a workgroup covers a tile: each invocation takes a 2×2 quad of pixels, held as the lanes of a vec4.
+const TILE_THREADS: u32 = TILE_WIDTH * TILE_HEIGHT / 4u;
+// Gaussians held in workgroup memory at a time.
+const BATCH: u32 = 64u;
 
 struct Quad {
     x: vec4<f32>,
