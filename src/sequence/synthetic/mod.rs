@@ -205,7 +205,9 @@ fn check_lens(camera: &Camera) -> Result<(), SceneError> {
     for (x, y) in along(right).flat_map(|x| [(x, 0.0), (x, bottom)]).chain(along(bottom).flat_map(|y| [(0.0, y), (right, y)])) {
         let recorded = nalgebra::Vector2::new(x, y);
         let back = camera.distort_pixel(&camera.undistort_pixel(&recorded));
-        if !((back - recorded).norm() < 1e-3) {
+        // Undistortion that runs away ends in NaN, which is no agreement either.
+        let agrees = (back - recorded).norm() < 1e-3;
+        if !agrees {
             let what = "are too strong: at the image's border the lens shows no single ray; use smaller coefficients".into();
             return Err(SceneError::Field { field: "camera.k1, k2, p1, p2", what });
         }

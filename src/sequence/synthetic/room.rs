@@ -41,7 +41,11 @@ pub fn furnish(config: &SceneConfig, path: &[Se3]) -> Result<Vec<Primitive>, Sce
     layout.several("furniture.windows", f.windows, |_, piece, _| piece.window())?;
     layout.several("furniture.shelves", f.shelves, |_, piece, _| piece.shelf())?;
     layout.several("furniture.sofas", f.sofas, |_, piece, _| piece.sofa())?;
-    layout.several("furniture.tables", f.tables, |k, piece, _| if k % 2 == 0 { piece.desk() } else { piece.dining_table() })?;
+    layout.several(
+        "furniture.tables",
+        f.tables,
+        |k, piece, _| if k.is_multiple_of(2) { piece.desk() } else { piece.dining_table() },
+    )?;
     layout.several("furniture.cabinets", f.cabinets, |_, piece, _| piece.cabinet())?;
     layout.several("furniture.plants", f.plants, |_, piece, _| piece.plant())?;
     layout.several("furniture.lamps", f.lamps, |_, piece, _| piece.lamp())?;
@@ -85,7 +89,7 @@ impl Layout<'_> {
         let mut found = 0;
         for _ in 0..TRIES {
             let wall = self.rng.usize(..4);
-            let along = if wall % 2 == 0 { self.room.width } else { self.room.depth };
+            let along = if wall.is_multiple_of(2) { self.room.width } else { self.room.depth };
             let slack = along - (high.x - low.x) - 2.0 * GAP;
             let draw = self.rng.f64();
             if slack <= 0.0 {

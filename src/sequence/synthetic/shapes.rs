@@ -65,10 +65,9 @@ impl Shape {
     /// Size of each chart in metres.
     pub fn charts(&self) -> Vec<DVec2> {
         match *self {
-            Self::Block { half } | Self::Shell { half } | Self::Ellipsoid { radii: half } => (0..6)
-                .map(|chart| block_axes(chart))
-                .map(|(_, u, v)| DVec2::new(half.dot(u.abs()), half.dot(v.abs())) * 2.0)
-                .collect(),
+            Self::Block { half } | Self::Shell { half } | Self::Ellipsoid { radii: half } => {
+                (0..6).map(block_axes).map(|(_, u, v)| DVec2::new(half.dot(u.abs()), half.dot(v.abs())) * 2.0).collect()
+            }
             Self::Cylinder { radius, half_height } => {
                 vec![DVec2::new(TURN * radius, 2.0 * half_height), DVec2::splat(2.0 * radius), DVec2::splat(2.0 * radius)]
             }

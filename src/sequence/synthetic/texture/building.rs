@@ -18,7 +18,7 @@ pub fn room(place: &Place, seed: u32) -> Vec3 {
             let kind = [0, 2, 1, 3][chart] + hash(1, 2, seed) as usize % 4;
             let wall = match kind % 4 {
                 0 => brick(place.uv, seed ^ 0x71),
-                1 | 3 => wallpaper(place.uv, seed ^ chart as u32 * 977),
+                1 | 3 => wallpaper(place.uv, seed ^ (chart as u32 * 977)),
                 _ => plaster(place, seed ^ 0x9F),
             };
             skirting(place, wall, seed)
@@ -56,7 +56,7 @@ fn grain(p: Vec2, tone: Vec3, seed: u32) -> Vec3 {
 pub fn wood(place: &Place, tint: Vec3, seed: u32) -> Vec3 {
     // Fibres run along the longer side.
     let p = if place.size.x >= place.size.y { place.uv } else { Vec2::new(place.uv.y, place.uv.x) };
-    let id = seed ^ place.chart as u32 * 131;
+    let id = seed ^ (place.chart as u32 * 131);
     let offset = Vec2::new(unit(1, 1, id), unit(2, 1, id)) * 9.0;
     let edge = 1.0 - 0.22 * (1.0 - ramp(0.0, 0.006, border(place.uv, place.size)));
     grain(p + offset, tint, id) * edge
