@@ -56,7 +56,7 @@ impl Default for TrackingConfig {
             min_depth_metres: 0.2,
             max_depth_metres: 6.0,
             pixel_sigma: 1.0,
-            inverse_depth_sigma: 0.02,
+            inverse_depth_sigma: 0.025,
             depth_edge_ratio: 0.05,
             min_initial_landmarks: 50,
             min_inliers: 20,
@@ -64,7 +64,7 @@ impl Default for TrackingConfig {
             keyframe_overlap: 0.8,
             keyframe_translation: 0.06,
             keyframe_rotation_rad: 0.12,
-            window_keyframes: 20,
+            window_keyframes: 24,
             bundle_iterations: 5,
         }
     }
