@@ -33,7 +33,8 @@ pub struct TrackingConfig {
     pub min_inliers: usize,
     /// As `min_inliers`, for a pose found again after being lost.
     pub min_relocalisation_inliers: usize,
-    /// A keyframe is due when fewer than this share of the reference keyframe's landmarks are still tracked.
+    /// A keyframe is due when fewer than this share of the reference keyframe's landmarks are still tracked (and the camera has moved
+    /// a quarter of what the next two ask for).
     pub keyframe_overlap: f64,
     /// A keyframe is due after moving this far from the reference keyframe, as a share of the scene's median depth.
     pub keyframe_translation: f64,
