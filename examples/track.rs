@@ -1,6 +1,6 @@
 //! Tracks a recorded sequence and says how well: `track <sequence folder> [trajectory.txt] [key=value …]` prints frames tracked,
 //! keyframes, ATE RMSE after SE(3) alignment, and the time per frame by stage. `key=value` sets a field of the
-//! tracking config; `every=N` takes every N-th frame.
+//! tracking config; `every=N` takes every N-th frame, `hold_out=N` lets no N-th frame become a keyframe.
 
 use std::error::Error;
 use std::path::Path;
@@ -16,16 +16,17 @@ const MAX_TIME_DIFFERENCE_S: f64 = 0.02;
 fn main() -> Result<(), Box<dyn Error>> {
     let (settings, paths): (Vec<String>, Vec<String>) = std::env::args().skip(1).partition(|a| a.contains('='));
     let folder = paths.first().ok_or("usage: track <sequence folder> [trajectory.txt] [key=value …]")?;
-    let (selection, settings): (Vec<String>, Vec<String>) = settings.into_iter().partition(|s| s.starts_with("every="));
-    let every = selection.first().map_or(Ok(1), |s| s["every=".len()..].parse())?;
-    let config: TrackingConfig = toml::from_str(&settings.join("\n"))?;
+    let number = |key: &str| settings.iter().find_map(|s| s.strip_prefix(key)).map(str::parse::<usize>).transpose();
+    let (every, hold_out) = (number("every=")?.unwrap_or(1), number("hold_out=")?.unwrap_or(usize::MAX));
+    let own = |s: &&String| !s.starts_with("every=") && !s.starts_with("hold_out=");
+    let config: TrackingConfig = toml::from_str(&settings.iter().filter(own).cloned().collect::<Vec<_>>().join("\n"))?;
     let mut sequence = Sequence::open(Path::new(folder), None, None)?;
     sequence.select(None, every)?;
     let mut tracker = Tracker::new(sequence.camera, &config)?;
     let (mut times, mut lost, mut inliers) = (Vec::<StageTimes>::new(), Vec::new(), Vec::new());
     let mut shared = Vec::new();
     for index in 0..sequence.entries.len() {
-        let tracked = tracker.track(&sequence.load(index)?, true)?;
+        let tracked = tracker.track(&sequence.load(index)?, (index + 1) % hold_out != 0)?;
         times.push(tracked.times);
         inliers.push(tracked.inliers);
         shared.extend(tracked.keyframe.map(|k| k.covisible.first().map_or(0, |c| c.1)));

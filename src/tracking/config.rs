@@ -33,7 +33,8 @@ pub struct TrackingConfig {
     pub min_inliers: usize,
     /// As `min_inliers`, for a pose found again after being lost.
     pub min_relocalisation_inliers: usize,
-    /// A keyframe is due when fewer than this share of the reference keyframe's landmarks are still tracked.
+    /// A keyframe is due when fewer than this share of the reference keyframe's landmarks are still tracked (and the camera has moved
+    /// a quarter of what the next two ask for).
     pub keyframe_overlap: f64,
     /// A keyframe is due after moving this far from the reference keyframe, as a share of the scene's median depth.
     pub keyframe_translation: f64,
@@ -56,7 +57,7 @@ impl Default for TrackingConfig {
             min_depth_metres: 0.2,
             max_depth_metres: 6.0,
             pixel_sigma: 1.0,
-            inverse_depth_sigma: 0.02,
+            inverse_depth_sigma: 0.025,
             depth_edge_ratio: 0.05,
             min_initial_landmarks: 50,
             min_inliers: 20,
@@ -64,7 +65,7 @@ impl Default for TrackingConfig {
             keyframe_overlap: 0.8,
             keyframe_translation: 0.06,
             keyframe_rotation_rad: 0.12,
-            window_keyframes: 20,
+            window_keyframes: 24,
             bundle_iterations: 5,
         }
     }

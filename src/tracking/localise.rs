@@ -45,6 +45,8 @@ pub struct Localised {
     /// The landmark that each feature shows.
     pub landmarks: Vec<Option<usize>>,
     pub inliers: usize,
+    /// How many were matched, inliers and outliers.
+    pub matches: usize,
     /// Whether the pose came without a prediction.
     pub rough: bool,
 }
@@ -89,7 +91,7 @@ impl Context<'_> {
     pub fn by_view(&self, frame: &FrameFeatures, view: &View) -> Option<Localised> {
         let rough = pose_from_view(&view.features.features, &view.points, frame, self.pinhole)?;
         let pairs: Vec<(usize, usize)> = rough.matches.iter().map(|m| (m.query, m.feature)).collect();
-        let mut found = self.settle(frame, &rough.camera_from_world, &pairs, &view.points, |i| view.landmarks[i]);
+        let mut found = self.settle(frame, &rough.camera_from_world, &pairs, |i| view.points[i], |i| view.landmarks[i]);
         if found.inliers >= ROUGH_INLIERS {
             let (guided, _) = self.search(frame, view, &found.camera_from_world, MOTION_RADII[1]);
             found = if guided.inliers > found.inliers { guided } else { found };
@@ -165,8 +167,7 @@ impl Context<'_> {
             taken[m.feature] = true;
             pairs.push((asked[m.query], m.feature));
         }
-        let positions: Vec<Option<Point3<f64>>> = self.map.landmarks.iter().map(|l| Some(l.position)).collect();
-        let mut found = self.settle(frame, &start.camera_from_world, &pairs, &positions, Some);
+        let mut found = self.settle(frame, &start.camera_from_world, &pairs, |l| Some(self.map.landmarks[l].position), Some);
         found.rough = start.rough;
         for l in found.landmarks.iter().flatten() {
             self.map.landmarks[*l].found += 1;
@@ -174,13 +175,13 @@ impl Context<'_> {
         found
     }
 
-    /// Optimises a pose over pairs (index into `known`, feature) and keeps the landmarks that agree.
+    /// Optimises a pose over pairs (source that `known` knows the point of, feature) and keeps the landmarks that agree.
     fn settle(
         &self,
         frame: &FrameFeatures,
         initial: &Se3,
         pairs: &[(usize, usize)],
-        known: &[Option<Point3<f64>>],
+        known: impl Fn(usize) -> Option<Point3<f64>>,
         landmark_of: impl Fn(usize) -> Option<usize>,
     ) -> Localised {
         let mut landmarks = vec![None; frame.len()];
@@ -188,7 +189,7 @@ impl Context<'_> {
             .iter()
             .filter_map(|(source, feature)| {
                 let measurement = frame.features[*feature].measurement(self.config);
-                known[*source].map(|point_in_world| (*source, *feature, PoseObservation { point_in_world, measurement }))
+                known(*source).map(|point_in_world| (*source, *feature, PoseObservation { point_in_world, measurement }))
             })
             .collect();
         let observations: Vec<PoseObservation> = usable.iter().map(|u| u.2).collect();
@@ -198,7 +199,13 @@ impl Context<'_> {
                 landmarks[*feature] = landmark_of(*source);
             }
         }
-        Localised { camera_from_world: estimate.camera_from_world, landmarks, inliers: estimate.inliers, rough: false }
+        Localised {
+            camera_from_world: estimate.camera_from_world,
+            landmarks,
+            inliers: estimate.inliers,
+            matches: usable.len(),
+            rough: false,
+        }
     }
 
     /// Looks for a view's points around where `pose` shows them, and settles the pose; also returns the number of matches.
@@ -220,7 +227,7 @@ impl Context<'_> {
         }
         let matches = match_by_projection(frame, &[], &queries, &MOTION_RULES);
         let pairs: Vec<(usize, usize)> = matches.iter().map(|m| (asked[m.query], m.feature)).collect();
-        (self.settle(frame, pose, &pairs, &view.points, |i| view.landmarks[i]), matches.len())
+        (self.settle(frame, pose, &pairs, |i| view.points[i], |i| view.landmarks[i]), matches.len())
     }
 
     fn local_landmarks(&self, start: &Localised, reference: usize) -> Vec<usize> {

@@ -17,6 +17,9 @@ use crate::sequence::Frame;
 /// For this many frames after the camera was found again, poses are held to the stricter count.
 const FRESHLY_FOUND_FRAMES: usize = 5;
 
+/// A true pose agrees with well over half of its matches, one by chance with few.
+const MIN_INLIER_SHARE: f64 = 0.35;
+
 /// RGB-D tracker.
 #[derive(Debug)]
 pub struct Tracker {
@@ -193,7 +196,11 @@ impl Tracker {
             let needed = self.config.min_relocalisation_inliers;
             found = context.by_the_map(features, reference).filter(|f| f.inliers >= needed);
         }
-        found.filter(|f| f.camera_from_world.to_homogeneous().iter().all(|v| v.is_finite()))
+        let trusted = |f: &Localised| {
+            let finite = f.camera_from_world.to_homogeneous().iter().all(|v| v.is_finite());
+            finite && f.inliers as f64 >= MIN_INLIER_SHARE * f.matches as f64
+        };
+        found.filter(trusted)
     }
 
     /// Takes a trusted pose in: motion, reference, record, and a keyframe if one is due.
