@@ -55,7 +55,6 @@ impl Kernel {
     pub fn dispatch(&self, gpu: &Gpu, pass: &mut wgpu::ComputePass<'_>, bindings: &[(u32, &GpuBuffer)], size: [u32; 3]) {
         pass.set_pipeline(&self.pipeline);
         pass.set_bind_group(0, &self.bind(gpu, bindings), &[]);
-        gpu.prof(pass, self.label);
         pass.dispatch_workgroups(size[0], size[1], size[2]);
     }
 
@@ -69,7 +68,6 @@ impl Kernel {
     ) {
         pass.set_pipeline(&self.pipeline);
         pass.set_bind_group(0, &self.bind(gpu, bindings), &[]);
-        gpu.prof(pass, self.label);
         pass.dispatch_workgroups_indirect(arguments.raw(), offset);
     }
 }
