@@ -2,11 +2,9 @@
 
 use bytemuck::{Pod, Zeroable};
 
-use super::adam::AdamSetup;
-use super::loss::LossSetup;
 use super::{AdamConfig, LossConfig, LossTerms, TargetImage};
 use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, workgroups};
-use crate::render::layout::{COUNTERS, Counter, VISIBLE_COUNTER, View, ViewCamera};
+use crate::render::layout::{AdamSetup, COUNTERS, Counter, LossSetup, VISIBLE_COUNTER, View, ViewCamera};
 use crate::render::{GpuCloud, PreparedView, Rasterizer, ViewCounts, cloud_from_planes, shaders};
 use crate::splat::GaussianCloud;
 

@@ -5,10 +5,8 @@
 
 use std::sync::Arc;
 
-use bytemuck::{Pod, Zeroable};
-
 use super::cloud::GpuCloud;
-use super::layout::{COUNTERS, Counter, PAIR_COUNTER, VISIBLE_COUNTER, View, ViewCamera};
+use super::layout::{COUNTERS, Counter, PAIR_COUNTER, TileListsSetup, VISIBLE_COUNTER, View, ViewCamera};
 use super::shaders;
 use super::sort::{Scan, ScanJob, ScanLength, Sort};
 use super::workspace::Workspace;
@@ -45,13 +43,6 @@ impl Rendered {
 pub struct ViewCounts {
     pub visible: u32,
     pub pairs: u32,
-}
-
-#[repr(C)]
-#[derive(Clone, Copy, Pod, Zeroable)]
-struct TileListsSetup {
-    emit: u32,
-    pad: [u32; 3],
 }
 
 #[derive(Debug)]
