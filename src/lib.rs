@@ -1,6 +1,7 @@
 //! Online Gaussian-splat SLAM: replays a recorded image sequence and produces a camera trajectory, a photorealistic Gaussian
 //! map and honest figures about both. `ARCHITECTURE.md` draws the whole; `CONVENTIONS.md` says what names, frames and units mean.
 
+pub mod bench;
 pub mod config;
 pub mod evaluation;
 pub mod export;

@@ -6,7 +6,7 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 /// A module, and the modules whose items it may name. `reference` is in nobody's list: only tests compare with it.
-const ALLOWED: [(&str, &[&str]); 15] = [
+const ALLOWED: [(&str, &[&str]); 16] = [
     ("geometry", &[]),
     ("sequence", &["geometry"]),
     ("splat", &["geometry"]),
@@ -15,6 +15,7 @@ const ALLOWED: [(&str, &[&str]); 15] = [
     ("reference", &["geometry", "splat"]),
     ("render", &["geometry", "splat", "gpu"]),
     ("optimise", &["geometry", "splat", "gpu", "render"]),
+    ("bench", &["geometry", "sequence", "splat", "gpu", "render", "optimise"]),
     ("mapping", &["geometry", "sequence", "splat", "gpu", "render", "optimise"]),
     ("export", &["geometry", "splat"]),
     ("evaluation", &["geometry", "sequence", "splat", "gpu", "render", "export"]),

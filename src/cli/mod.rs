@@ -1,6 +1,7 @@
 //! The command line: one file per subcommand.
 
 mod adapters;
+mod bench;
 mod demo;
 mod eval;
 mod generate;
@@ -43,6 +44,8 @@ enum Command {
     Generate(generate::GenerateArgs),
     /// Measure a finished run, of ours or anybody's.
     Eval(eval::EvalArgs),
+    /// Measure speed.
+    Bench(bench::BenchArgs),
     /// List the adapters that the mapper could use.
     Adapters,
 }
@@ -69,6 +72,7 @@ pub fn main() -> miette::Result<()> {
         Command::Demo(args) => demo::demo(&args, verbosity),
         Command::Generate(args) => generate::generate(&args, verbosity),
         Command::Eval(args) => eval::eval(&args, verbosity),
+        Command::Bench(args) => bench::bench(&args),
         Command::Adapters => {
             adapters::adapters();
             Ok(())

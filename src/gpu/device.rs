@@ -6,6 +6,8 @@ use std::sync::{Arc, Mutex, PoisonError};
 use serde::Serialize;
 use wgpu::{Backends, InstanceDescriptor, InstanceFlags};
 
+use super::profile::Profiler;
+
 #[derive(Debug, thiserror::Error)]
 pub enum GpuError {
     #[error(
@@ -61,6 +63,7 @@ pub struct Gpu {
     pub adapter: AdapterSummary,
     failure: Arc<Mutex<Option<Failure>>>,
     pub(super) memory: Arc<MemoryCount>,
+    pub(super) profiler: Option<Profiler>,
 }
 
 #[derive(Debug)]
@@ -115,6 +118,15 @@ pub fn adapters() -> Vec<AdapterSummary> {
 impl Gpu {
     /// Opens the fastest adapter, or the first whose name contains `wanted` (any case).
     pub fn open(wanted: Option<&str>) -> Result<Arc<Self>, GpuError> {
+        Self::open_with(wanted, wgpu::Features::empty())
+    }
+
+    /// The same, with timestamps where the adapter has them (see [`Self::take_profile`]).
+    pub fn open_profiled(wanted: Option<&str>) -> Result<Arc<Self>, GpuError> {
+        Self::open_with(wanted, Profiler::FEATURES)
+    }
+
+    fn open_with(wanted: Option<&str>, wished: wgpu::Features) -> Result<Arc<Self>, GpuError> {
         let mut adapters = sorted_adapters(&instance());
         if adapters.is_empty() {
             return Err(GpuError::NoAdapter);
@@ -135,12 +147,15 @@ impl Gpu {
             max_storage_buffer_binding_size: offered.max_storage_buffer_binding_size,
             ..wgpu::Limits::default()
         };
-        let descriptor = wgpu::DeviceDescriptor { label: Some("keysplat"), required_limits, ..Default::default() };
+        let required_features = wished & adapter.features();
+        let descriptor =
+            wgpu::DeviceDescriptor { label: Some("keysplat"), required_features, required_limits, ..Default::default() };
         let (device, queue) = pollster::block_on(adapter.request_device(&descriptor))
             .map_err(|source| GpuError::Device { adapter: names[index].clone(), source })?;
         let failure = Arc::new(Mutex::new(None));
         watch(&device, &failure);
-        Ok(Arc::new(Self { device, queue, adapter: adapter.get_info().into(), failure, memory: Arc::default() }))
+        let profiler = required_features.contains(Profiler::FEATURES).then(|| Profiler::new(&device));
+        Ok(Arc::new(Self { device, queue, adapter: adapter.get_info().into(), failure, memory: Arc::default(), profiler }))
     }
 
     /// The first failure that the device reported since it was opened, if any.

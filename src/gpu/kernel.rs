@@ -55,6 +55,7 @@ impl Kernel {
     pub fn dispatch(&self, gpu: &Gpu, pass: &mut wgpu::ComputePass<'_>, bindings: &[(u32, &GpuBuffer)], size: [u32; 3]) {
         pass.set_pipeline(&self.pipeline);
         pass.set_bind_group(0, &self.bind(gpu, bindings), &[]);
+        gpu.mark(pass, self.label);
         pass.dispatch_workgroups(size[0], size[1], size[2]);
     }
 
@@ -68,6 +69,7 @@ impl Kernel {
     ) {
         pass.set_pipeline(&self.pipeline);
         pass.set_bind_group(0, &self.bind(gpu, bindings), &[]);
+        gpu.mark(pass, self.label);
         pass.dispatch_workgroups_indirect(arguments.raw(), offset);
     }
 }

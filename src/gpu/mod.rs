@@ -3,6 +3,7 @@
 mod buffer;
 mod device;
 mod kernel;
+mod profile;
 
 pub use buffer::GpuBuffer;
 pub use device::{AdapterSummary, Gpu, GpuError, adapters};

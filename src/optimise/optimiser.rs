@@ -258,6 +258,7 @@ impl Optimiser {
             self.encode_loss(&mut pass, rasterizer, target, loss)?;
         }
         self.encode_backward(&mut pass, rasterizer, cloud, &prepared, sink);
+        gpu.mark(&mut pass, "end");
         Ok(())
     }
 

@@ -1,0 +1,109 @@
+//! How much work a view really is: pairs, evaluations, blended evaluations, counted from the buffers that the GPU left.
+
+use rayon::prelude::*;
+use serde::Serialize;
+
+use crate::gpu::GpuError;
+use crate::render::layout::{ALPHA_MAX, TILE_HEIGHT, TILE_WIDTH, TRANSMITTANCE_MIN, ViewCamera};
+use crate::render::{GpuCloud, Rasterizer, ViewCounts};
+
+/// Counted work of one view.
+#[derive(Clone, Copy, Debug, Default, Serialize)]
+pub struct Work {
+    pub gaussians: u64,
+    pub visible: u64,
+    pub pairs: u64,
+    /// (Gaussian, pixel) pairs whose exponent is computed in the forward pass: a tile's Gaussians times its pixels, until all its
+    /// pixels are finished.
+    pub evaluations: u64,
+    /// Those that are blended.
+    pub blended: u64,
+    /// Evaluations up to each tile's last contributor: the backward pass's share.
+    pub backward_evaluations: u64,
+    pub pixels: u64,
+    pub tiles: u64,
+}
+
+#[derive(Clone, Copy, Default)]
+struct TileWork {
+    evaluations: u64,
+    blended: u64,
+    backward_evaluations: u64,
+}
+
+/// Renders the view once more and counts.
+pub fn count_work(rasterizer: &mut Rasterizer, cloud: &GpuCloud, camera: &ViewCamera) -> Result<Work, GpuError> {
+    let rendered = rasterizer.render(cloud, camera, [0.0; 3])?;
+    let counts: ViewCounts = rasterizer.finish()?.unwrap_or_default();
+    let gpu = rasterizer.gpu().clone();
+    let (width, height) = (rendered.width, rendered.height);
+    let tiles_x = width.div_ceil(TILE_WIDTH);
+    let tiles = tiles_x * height.div_ceil(TILE_HEIGHT);
+    let sorted = rasterizer.prepare(cloud, camera, [0.0; 3])?.sorted;
+    let ws = &rasterizer.workspace;
+    let ranges: Vec<[u32; 2]> = ws.ranges.read(&gpu, 0, tiles as usize)?;
+    let slots: Vec<u32> = ws.slots[sorted].read(&gpu, 0, counts.pairs as usize)?;
+    let slot_gaussians: Vec<u32> = ws.slot_gaussians.read(&gpu, 0, counts.pairs as usize)?;
+    let means: Vec<[f32; 4]> = ws.projected.read(&gpu, 0, cloud.len())?;
+    let conics: Vec<[f32; 4]> = ws.projected.read(&gpu, cloud.capacity(), cloud.len())?;
+    let splat = |pair: u32| {
+        let gaussian = slot_gaussians[slots[pair as usize] as usize] as usize;
+        (means[gaussian], conics[gaussian])
+    };
+    let per_tile: Vec<TileWork> = (0..tiles)
+        .into_par_iter()
+        .map(|tile| {
+            let (x0, y0) = (tile % tiles_x * TILE_WIDTH, tile / tiles_x * TILE_HEIGHT);
+            let pixels =
+                (y0..(y0 + TILE_HEIGHT).min(height)).flat_map(|y| (x0..(x0 + TILE_WIDTH).min(width)).map(move |x| (x, y)));
+            tile_work(ranges[tile as usize], &pixels.collect::<Vec<_>>(), &splat)
+        })
+        .collect();
+    let sum = |f: fn(&TileWork) -> u64| per_tile.iter().map(f).sum();
+    Ok(Work {
+        gaussians: cloud.len() as u64,
+        visible: u64::from(counts.visible),
+        pairs: u64::from(counts.pairs),
+        evaluations: sum(|t| t.evaluations),
+        blended: sum(|t| t.blended),
+        backward_evaluations: sum(|t| t.backward_evaluations),
+        pixels: u64::from(width * height),
+        tiles: u64::from(tiles),
+    })
+}
+
+fn tile_work([first, end]: [u32; 2], pixels: &[(u32, u32)], splat: &dyn Fn(u32) -> ([f32; 4], [f32; 4])) -> TileWork {
+    let mut work = TileWork::default();
+    let mut transmittance = vec![1.0f32; pixels.len()];
+    let mut finished = vec![false; pixels.len()];
+    let mut last = first;
+    for pair in first..end {
+        // The GPU looks for finished tiles once per batch.
+        if (pair - first) % 64 == 0 && finished.iter().all(|f| *f) {
+            break;
+        }
+        let (mean, conic) = splat(pair);
+        work.evaluations += pixels.len() as u64;
+        for (i, &(x, y)) in pixels.iter().enumerate() {
+            if finished[i] {
+                continue;
+            }
+            let (dx, dy) = (x as f32 - mean[0], y as f32 - mean[1]);
+            let power = -0.5 * (conic[0] * dx * dx + conic[2] * dy * dy) - conic[1] * dx * dy;
+            if power + mean[3] < 0.0 {
+                continue;
+            }
+            let alpha = (conic[3] * power.min(0.0).exp()).min(ALPHA_MAX as f32);
+            let next = transmittance[i] * (1.0 - alpha);
+            if next < TRANSMITTANCE_MIN as f32 {
+                finished[i] = true;
+                continue;
+            }
+            transmittance[i] = next;
+            work.blended += 1;
+            last = pair + 1;
+        }
+    }
+    work.backward_evaluations = u64::from(last - first) * pixels.len() as u64;
+    work
+}
