@@ -1,5 +1,7 @@
-//! Random scenes that the gradient tests share.
+//! What test binaries share: random scenes for the gradient tests, and a tiny recording for those of the whole program.
 #![allow(dead_code, reason = "each test binary uses its own part")]
+
+pub mod recording;
 
 use fastrand::Rng;
 use glam::{Quat, Vec3};
