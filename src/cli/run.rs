@@ -1,6 +1,6 @@
 //! `keysplat run`
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -127,17 +127,28 @@ pub fn replay(mut config: Config, out: PathBuf, stop: Arc<AtomicBool>, verbosity
     if outcome.poses.is_empty() {
         return nothing_made(error, windows.stopped());
     }
-    let map = outputs::write_results(&out, &outcome, config).into_diagnostic()?;
+    let finished = write_and_measure((&sequence, config), &gpu, &outcome, &out, verbosity);
+    match (error, finished) {
+        (None, finished) => finished,
+        (Some(error), Ok(())) => Err(miette!("{error}\nThe run ended early; what there was until then is in {}", out.display())),
+        (Some(error), Err(then)) => Err(miette!("{error}\nThe run ended early, and then: {then}")),
+    }
+}
+
+fn write_and_measure(
+    (sequence, config): (&Sequence, &Config),
+    gpu: &Arc<Gpu>,
+    outcome: &Outcome,
+    out: &Path,
+    verbosity: Verbosity,
+) -> miette::Result<()> {
+    let map = outputs::write_results(out, outcome, config).into_diagnostic()?;
     let bar = progress::bar(verbosity, outcome.poses.len() as u64, "{wide_bar} {pos}/{len} views compared");
-    let measured = outputs::measure((&sequence, config), &gpu, &subject(&outcome), &out, &|done| bar.set_position(done as u64));
+    let measured = outputs::measure((sequence, config), gpu, &subject(outcome), out, &|done| bar.set_position(done as u64));
     bar.finish_and_clear();
     let measured = measured.into_diagnostic()?;
-    let metrics = outputs::write_metrics((&sequence, config), &gpu, &outcome, (measured, map), &out).into_diagnostic()?;
-    print_metrics(&metrics, verbosity)?;
-    match error {
-        None => Ok(()),
-        Some(error) => Err(miette!("{error}\nThe run ended early; what there was until then is in {}", out.display())),
-    }
+    let metrics = outputs::write_metrics((sequence, config), gpu, outcome, (measured, map), out).into_diagnostic()?;
+    print_metrics(&metrics, verbosity)
 }
 
 /// Without a pose there is no trajectory, no map and no figure; what an earlier run left in the folder stays.
