@@ -6,7 +6,7 @@ mod common;
 use fastrand::Rng;
 use keysplat::geometry::Pinhole;
 use keysplat::gpu::Gpu;
-use keysplat::optimise::{AdamConfig, LossConfig, Optimiser, TargetImage};
+use keysplat::optimise::{AdamConfig, LossConfig, Optimiser, TargetImage, TrainingView};
 use keysplat::reference::adam::Adam64;
 use keysplat::reference::loss::{LossWeights, Target64, loss};
 use keysplat::reference::project_backward::backward;
@@ -167,7 +167,8 @@ fn adam_steps_agree() {
             let decay = (f64::from(adam.beta_1), f64::from(adam.beta_2), f64::from(adam.epsilon));
             states[i].step(&mut expected[i], &gradient.flat(), &rates, decay);
         }
-        optimiser.step(&mut rasterizer, &on_gpu, &camera, &image, (&loss, &adam)).unwrap();
+        let view = TrainingView { camera, target: &image };
+        optimiser.steps(&mut rasterizer, &on_gpu, &[view], (&loss, &adam)).unwrap();
     }
     let moved = on_gpu.download(&gpu).unwrap();
     let start = flat(&cloud64(&cloud));
@@ -253,4 +254,13 @@ fn pairs_that_outgrow_their_buffers_are_never_dropped() {
     let counts = rasterizer.finish().unwrap().unwrap();
     assert!(counts.pairs > 131_072, "the scene does not overflow: {counts:?}");
     assert_eq!(first, rasterizer.render(&on_gpu, &camera, BACKGROUND).unwrap(), "rendering is repeatable to the bit");
+
+    // Training: steps that did not fit are repeated, and all of them count.
+    let image = TargetImage::new(&gpu, &target(&mut rng, camera.pinhole).0).unwrap();
+    let mut rasterizer = Rasterizer::new(gpu.clone()).unwrap();
+    let views = [TrainingView { camera, target: &image }; 3];
+    let configs = (&LossConfig::default(), &AdamConfig::default());
+    let reports = Optimiser::new(&gpu).unwrap().steps(&mut rasterizer, &on_gpu, &views, configs).unwrap();
+    assert!(reports.iter().all(|r| r.counts.pairs > 131_072 && r.loss.l1 > 0.0), "{reports:?}");
+    assert!(reports[2].loss.total(configs.0) < reports[0].loss.total(configs.0), "the steps did not descend");
 }

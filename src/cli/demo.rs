@@ -19,14 +19,14 @@ const DIGEST_FILE: &str = "digest.txt";
 
 #[derive(Args)]
 pub struct DemoArgs {
-    /// Folder for the results; the recording is kept in `<out>/recording`.
+    /// Folder for the results; the recording is kept in `<out>/demo-room`.
     #[arg(short, long, default_value = "out/demo")]
     out: PathBuf,
 }
 
 pub fn demo(args: &DemoArgs, verbosity: Verbosity) -> miette::Result<()> {
     let scene: SceneConfig = toml::from_str(SCENE).into_diagnostic()?;
-    let recording = args.out.join("recording");
+    let recording = args.out.join("demo-room");
     if !is_current(&recording, &scene) {
         if recording.exists() {
             std::fs::remove_dir_all(&recording).into_diagnostic()?;

@@ -10,11 +10,13 @@ use super::keyframe::MappedKeyframe;
 use super::{Keyframe, KeyframeId, MappingConfig, prune, seeding};
 use crate::geometry::Se3;
 use crate::gpu::{Gpu, GpuError};
-use crate::optimise::{Optimiser, StepReport};
+use crate::optimise::{Optimiser, StepReport, TrainingView};
 use crate::render::{GpuCloud, Rasterizer, Rendered, ViewCamera};
 use crate::splat::GaussianCloud;
 
 const FIRST_CAPACITY: usize = 32_768;
+/// Steps submitted at once: the GPU never waits for the host between them, and a stop is heeded between batches.
+const BATCH: usize = 10;
 
 #[derive(Debug, thiserror::Error)]
 pub enum MappingError {
@@ -103,7 +105,7 @@ impl Mapper {
         Ok(self.rasterizer.render(&self.cloud, camera, [0.0; 3])?)
     }
 
-    /// Duration of each step so far.
+    /// Duration of each step so far: its share of its batch.
     pub fn step_times(&self) -> &[Duration] {
         &self.step_times
     }
@@ -124,23 +126,26 @@ impl Mapper {
         let mut psnr_sum = 0.0;
         let mut done = 0;
         while done < iterations && !stop() && !self.cloud.is_empty() {
-            let index = self.draw(&window, done);
+            let batch: Vec<usize> = (done..iterations.min(done + BATCH)).map(|step| self.draw(&window, step)).collect();
             let started = Instant::now();
-            let report = self.step(index)?;
-            self.step_times.push(started.elapsed());
-            if !report.loss.total(&self.config.loss).is_finite() {
-                return Err(MappingError::NotFinite { id: self.keyframes[index].id });
+            let reports = self.steps(&batch)?;
+            let share = started.elapsed() / batch.len() as u32;
+            self.step_times.extend(std::iter::repeat_n(share, batch.len()));
+            for (report, &index) in reports.iter().zip(&batch) {
+                if !report.loss.total(&self.config.loss).is_finite() {
+                    return Err(MappingError::NotFinite { id: self.keyframes[index].id });
+                }
+                psnr_sum += report.loss.psnr_db();
             }
-            psnr_sum += report.loss.psnr_db();
-            done += 1;
+            done += batch.len();
         }
         Ok((done, psnr_sum / done.max(1) as f32))
     }
 
-    fn step(&mut self, index: usize) -> Result<StepReport, GpuError> {
-        let keyframe = &self.keyframes[index];
-        let configs = (&self.config.loss, &self.config.adam);
-        self.optimiser.step(&mut self.rasterizer, &self.cloud, &keyframe.camera, &keyframe.target, configs)
+    fn steps(&mut self, batch: &[usize]) -> Result<Vec<StepReport>, GpuError> {
+        let view = |&index: &usize| TrainingView { camera: self.keyframes[index].camera, target: &self.keyframes[index].target };
+        let views: Vec<TrainingView<'_>> = batch.iter().map(view).collect();
+        self.optimiser.steps(&mut self.rasterizer, &self.cloud, &views, (&self.config.loss, &self.config.adam))
     }
 
     /// Indices of the newest keyframes and of the older ones that share most landmarks with the newest.

@@ -1,7 +1,8 @@
 //! Adam's step sizes, and their form on the GPU.
 
-use bytemuck::{Pod, Zeroable};
 use serde::{Deserialize, Serialize};
+
+use crate::render::layout::AdamSetup;
 
 /// Step sizes and decay rates (Kingma & Ba 2015; the ratios between parameters follow 3DGS, Kerbl et al. 2023).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -54,19 +55,6 @@ impl AdamConfig {
         }
         if self.epsilon.is_finite() && self.epsilon > 0.0 { Ok(()) } else { Err("epsilon must be positive".into()) }
     }
-}
-
-/// Host twin of `AdamSetup` in `shaders/shared/sink_adam.wgsl`.
-#[repr(C)]
-#[derive(Clone, Copy, Debug, Pod, Zeroable)]
-pub(super) struct AdamSetup {
-    rates: [[f32; 4]; 5],
-    beta_1: f32,
-    beta_2: f32,
-    epsilon: f32,
-    log_beta_1: f32,
-    log_beta_2: f32,
-    pad: [f32; 3],
 }
 
 impl From<&AdamConfig> for AdamSetup {

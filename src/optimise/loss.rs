@@ -1,6 +1,5 @@
 //! What a view should look like, and the weights of the loss.
 
-use bytemuck::{Pod, Zeroable};
 use serde::{Deserialize, Serialize};
 
 use crate::gpu::{Gpu, GpuBuffer, GpuError};
@@ -67,16 +66,6 @@ impl LossTerms {
     pub fn psnr_db(&self) -> f32 {
         -10.0 * self.mse.max(1e-10).log10()
     }
-}
-
-/// Host twin of `LossSetup` in the loss shaders.
-#[repr(C)]
-#[derive(Clone, Copy, Debug, Pod, Zeroable)]
-pub(super) struct LossSetup {
-    pub width: u32,
-    pub height: u32,
-    pub ssim_weight: f32,
-    pub depth_weight: f32,
 }
 
 /// A keyframe's image on the GPU: 8-bit colour and sensor depth.

@@ -6,4 +6,4 @@ mod optimiser;
 
 pub use adam::AdamConfig;
 pub use loss::{LossConfig, LossTerms, TargetImage};
-pub use optimiser::{Gradients, Optimiser, StepReport};
+pub use optimiser::{Gradients, Optimiser, StepReport, TrainingView};

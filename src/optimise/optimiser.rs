@@ -1,20 +1,35 @@
 //! One training step on the GPU: forward, loss, backward, Adam; and the same without stepping, for whoever wants the gradients.
 
-use super::adam::AdamSetup;
-use super::loss::LossSetup;
+use bytemuck::{Pod, Zeroable};
+
 use super::{AdamConfig, LossConfig, LossTerms, TargetImage};
 use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, workgroups};
-use crate::render::layout::{Counter, VISIBLE_COUNTER, View, ViewCamera};
+use crate::render::layout::{AdamSetup, COUNTERS, Counter, LossSetup, VISIBLE_COUNTER, View, ViewCamera};
 use crate::render::{GpuCloud, PreparedView, Rasterizer, ViewCounts, cloud_from_planes, shaders};
 use crate::splat::GaussianCloud;
 
 const LOSS_TILE: u32 = 16;
 
 /// What a step did.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct StepReport {
     pub loss: LossTerms,
     pub counts: ViewCounts,
+}
+
+/// A view to learn from.
+#[derive(Clone, Copy, Debug)]
+pub struct TrainingView<'a> {
+    pub camera: ViewCamera,
+    pub target: &'a TargetImage,
+}
+
+/// What a step leaves behind on the GPU: sums of the loss, and the counters.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+struct StepLog {
+    loss: [f32; 4],
+    counters: [Counter; COUNTERS as usize],
 }
 
 /// Gradient of a loss by the map and by the pose.
@@ -92,19 +107,61 @@ impl Optimiser {
         })
     }
 
-    /// Renders the map from `camera`, compares it with `target`, and moves the Gaussians that were blended by one step of Adam.
-    pub fn step(
+    /// For each view in turn: renders the map, compares it with the target, and moves the Gaussians that were blended by one step of
+    /// Adam. The steps are submitted without waiting in between; what they report is read at the end. A step whose pairs did not
+    /// fit moved nothing and is repeated after the others, with larger buffers.
+    pub fn steps(
         &mut self,
         rasterizer: &mut Rasterizer,
         cloud: &GpuCloud,
-        camera: &ViewCamera,
-        target: &TargetImage,
+        views: &[TrainingView<'_>],
         (loss, adam): (&LossConfig, &AdamConfig),
-    ) -> Result<StepReport, GpuError> {
+    ) -> Result<Vec<StepReport>, GpuError> {
         let gpu = rasterizer.gpu().clone();
         let adam = GpuBuffer::uniform(&gpu, "Adam", &AdamSetup::from(adam))?;
-        let counts = self.run(rasterizer, cloud, camera, [0.0; 3], &Objective::Image(target, loss), &Sink::Adam(&adam))?;
-        Ok(StepReport { loss: self.read_loss(&gpu, target)?, counts })
+        let log = GpuBuffer::storage(&gpu, "step log", (views.len() * std::mem::size_of::<StepLog>()) as u64)?;
+        let mut reports = vec![StepReport::default(); views.len()];
+        let mut pending: Vec<usize> = (0..views.len()).collect();
+        while !pending.is_empty() {
+            for (entry, &i) in pending.iter().enumerate() {
+                let TrainingView { camera, target } = &views[i];
+                let mut encoder = gpu.device.create_command_encoder(&Default::default());
+                self.encode(
+                    &mut encoder,
+                    rasterizer,
+                    cloud,
+                    (camera, [0.0; 3]),
+                    &Objective::Image(target, loss),
+                    &Sink::Adam(&adam),
+                )?;
+                self.encode_log(&mut encoder, rasterizer, &log, entry);
+                gpu.queue.submit([encoder.finish()]);
+            }
+            let entries: Vec<StepLog> = log.read(&gpu, 0, pending.len())?;
+            let mut repeat = Vec::new();
+            for (&i, entry) in pending.iter().zip(&entries) {
+                match rasterizer.counts(&entry.counters) {
+                    Some(counts) => {
+                        let pixels = views[i].target.width * views[i].target.height;
+                        reports[i] = StepReport { loss: LossTerms::from_sums(entry.loss, pixels), counts };
+                    }
+                    None => repeat.push(i),
+                }
+            }
+            for entry in &entries {
+                rasterizer.make_room(&entry.counters)?;
+            }
+            pending = repeat;
+        }
+        Ok(reports)
+    }
+
+    fn encode_log(&self, encoder: &mut wgpu::CommandEncoder, rasterizer: &Rasterizer, log: &GpuBuffer, entry: usize) {
+        let to = (entry * std::mem::size_of::<StepLog>()) as u64;
+        let counters = &rasterizer.workspace.counters;
+        let counters_at = std::mem::offset_of!(StepLog, counters) as u64;
+        encoder.copy_buffer_to_buffer(self.loss_total.raw(), 0, log.raw(), to, counters_at);
+        encoder.copy_buffer_to_buffer(counters.raw(), 0, log.raw(), to + counters_at, counters.raw().size());
     }
 
     /// The same, but returns the gradients and moves nothing.
@@ -149,7 +206,7 @@ impl Optimiser {
     ) -> Result<Gradients, GpuError> {
         let gpu = rasterizer.gpu().clone();
         let sink = GpuBuffer::storage(&gpu, "gradients", cloud.parameters().raw().size())?;
-        self.run(rasterizer, cloud, camera, background, objective, &Sink::Gradient(&sink))?;
+        self.run(rasterizer, cloud, (camera, background), objective, &Sink::Gradient(&sink))?;
         let planes = (0..cloud.planes())
             .map(|plane| sink.read(&gpu, plane * cloud.capacity(), cloud.len()))
             .collect::<Result<Vec<_>, _>>()?;
@@ -158,38 +215,50 @@ impl Optimiser {
         Ok(Gradients { loss: LossTerms::default(), cloud: cloud_from_planes(cloud.sh_degree(), &planes), pose })
     }
 
-    /// Submits the step, again with larger buffers if its pairs did not fit.
+    /// Submits one step and waits, again with larger buffers if its pairs did not fit.
     fn run(
         &mut self,
         rasterizer: &mut Rasterizer,
         cloud: &GpuCloud,
-        camera: &ViewCamera,
-        background: [f32; 3],
+        view: (&ViewCamera, [f32; 3]),
         objective: &Objective<'_>,
         sink: &Sink<'_>,
-    ) -> Result<ViewCounts, GpuError> {
+    ) -> Result<(), GpuError> {
         let gpu = rasterizer.gpu().clone();
         loop {
-            let prepared = rasterizer.prepare(cloud, camera, background)?;
-            self.reserve(&gpu, &prepared.view, cloud)?;
             let mut encoder = gpu.device.create_command_encoder(&Default::default());
-            rasterizer.encode_clear(&mut encoder);
-            if let Sink::Gradient(buffer) = sink {
-                encoder.clear_buffer(buffer.raw(), 0, None);
-            }
-            {
-                let mut pass = encoder.begin_compute_pass(&Default::default());
-                rasterizer.encode_forward(&mut pass, cloud, &prepared)?;
-                if let Objective::Image(target, loss) = objective {
-                    self.encode_loss(&mut pass, rasterizer, target, loss)?;
-                }
-                self.encode_backward(&mut pass, rasterizer, cloud, &prepared, sink);
-            }
+            self.encode(&mut encoder, rasterizer, cloud, view, objective, sink)?;
             gpu.queue.submit([encoder.finish()]);
-            if let Some(counts) = rasterizer.finish()? {
-                return Ok(counts);
+            if rasterizer.finish()?.is_some() {
+                return Ok(());
             }
         }
+    }
+
+    /// Encodes one whole step.
+    fn encode(
+        &mut self,
+        encoder: &mut wgpu::CommandEncoder,
+        rasterizer: &mut Rasterizer,
+        cloud: &GpuCloud,
+        (camera, background): (&ViewCamera, [f32; 3]),
+        objective: &Objective<'_>,
+        sink: &Sink<'_>,
+    ) -> Result<(), GpuError> {
+        let gpu = rasterizer.gpu().clone();
+        let prepared = rasterizer.prepare(cloud, camera, background)?;
+        self.reserve(&gpu, &prepared.view, cloud)?;
+        rasterizer.encode_clear(encoder);
+        if let Sink::Gradient(buffer) = sink {
+            encoder.clear_buffer(buffer.raw(), 0, None);
+        }
+        let mut pass = encoder.begin_compute_pass(&Default::default());
+        rasterizer.encode_forward(&mut pass, cloud, &prepared)?;
+        if let Objective::Image(target, loss) = objective {
+            self.encode_loss(&mut pass, rasterizer, target, loss)?;
+        }
+        self.encode_backward(&mut pass, rasterizer, cloud, &prepared, sink);
+        Ok(())
     }
 
     fn encode_loss(

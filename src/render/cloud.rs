@@ -2,7 +2,7 @@
 
 use glam::{Quat, Vec3};
 
-use super::layout::GEOMETRY_PLANES;
+use super::layout::{GEOMETRY_PLANES, GatherSetup};
 use super::shaders;
 use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, workgroups};
 use crate::splat::{GaussianCloud, ShDegree};
@@ -18,15 +18,6 @@ pub struct GpuCloud {
     moments_1: GpuBuffer,
     moments_2: GpuBuffer,
     gather: Kernel,
-}
-
-#[repr(C)]
-#[derive(Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
-struct GatherSetup {
-    count: u32,
-    planes: u32,
-    capacity_in: u32,
-    capacity_out: u32,
 }
 
 impl GpuCloud {

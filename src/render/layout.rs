@@ -68,25 +68,6 @@ pub struct ViewCamera {
     pub camera_from_world: Se3,
 }
 
-/// Host twin of `View` in `shaders/shared/view.wgsl`.
-#[repr(C)]
-#[derive(Clone, Copy, Debug, Pod, Zeroable)]
-pub struct View {
-    pub camera_rows: [[f32; 4]; 3],
-    pub center_in_world: [f32; 4],
-    pub intrinsics: [f32; 4],
-    pub tangent_bounds: [f32; 4],
-    pub background: [f32; 4],
-    pub width: u32,
-    pub height: u32,
-    pub tiles_x: u32,
-    pub tiles_y: u32,
-    pub gaussian_count: u32,
-    pub capacity: u32,
-    pub sh_degree: u32,
-    pub pair_capacity: u32,
-}
-
 /// The bounds min x, max x, min y, max y on x/z and y/z inside the projection's Jacobian.
 pub fn tangent_bounds(p: &Pinhole) -> [f64; 4] {
     let (w, h) = (f64::from(p.width), f64::from(p.height));
@@ -103,7 +84,9 @@ impl View {
         let center: Vector3<f64> = -(rotation.inverse() * translation);
         let row = |r: usize| [rotation[(r, 0)] as f32, rotation[(r, 1)] as f32, rotation[(r, 2)] as f32, translation[r] as f32];
         Self {
-            camera_rows: [row(0), row(1), row(2)],
+            camera_row_0: row(0),
+            camera_row_1: row(1),
+            camera_row_2: row(2),
             center_in_world: [center.x as f32, center.y as f32, center.z as f32, 0.0],
             intrinsics: [p.fx as f32, p.fy as f32, p.cx as f32, p.cy as f32],
             tangent_bounds: tangent_bounds(p).map(|v| v as f32),
@@ -128,16 +111,6 @@ impl View {
     }
 }
 
-/// Host twin of `Counter` in `shaders/shared/counters.wgsl`.
-#[repr(C)]
-#[derive(Clone, Copy, Debug, Default, Pod, Zeroable)]
-pub struct Counter {
-    pub count: u32,
-    pub needed: u32,
-    pub per_element: [u32; 3],
-    pub per_block: [u32; 3],
-}
-
 impl Counter {
     const SIZE: u64 = std::mem::size_of::<Self>() as u64;
 
@@ -149,6 +122,89 @@ impl Counter {
     /// Byte offset of a counter's indirect arguments with one workgroup per sort block.
     pub const fn per_block_offset(counter: u32) -> u64 {
         counter as u64 * Self::SIZE + 20
+    }
+}
+
+/// Declares host twins of WGSL structs, and lists their layouts so that `tests/shaders.rs` can compare them with the shaders.
+macro_rules! host_twins {
+    ($($(#[$doc:meta])* $name:ident { $($(#[$field_doc:meta])* $field:ident: $type:ty,)* })*) => {
+        $($(#[$doc])*
+        #[repr(C)]
+        #[derive(Clone, Copy, Debug, Pod, Zeroable)]
+        pub struct $name { $($(#[$field_doc])* pub $field: $type,)* })*
+
+        /// Layouts of all structs that host and shaders share: name, size, and the fields' offsets, all in bytes.
+        pub fn struct_layouts() -> Vec<(&'static str, usize, Vec<(&'static str, usize)>)> {
+            vec![
+                $((stringify!($name), size_of::<$name>(), vec![$((stringify!($field), std::mem::offset_of!($name, $field))),*]),)*
+            ]
+        }
+    };
+}
+
+host_twins! {
+    /// One camera view of the map (`shaders/shared/view.wgsl`).
+    View {
+        camera_row_0: [f32; 4],
+        camera_row_1: [f32; 4],
+        camera_row_2: [f32; 4],
+        center_in_world: [f32; 4],
+        intrinsics: [f32; 4],
+        tangent_bounds: [f32; 4],
+        background: [f32; 4],
+        width: u32,
+        height: u32,
+        tiles_x: u32,
+        tiles_y: u32,
+        gaussian_count: u32,
+        capacity: u32,
+        sh_degree: u32,
+        pair_capacity: u32,
+    }
+    /// Counts made on the GPU, and the indirect dispatches that follow from them (`shaders/shared/counters.wgsl`).
+    #[derive(Default)]
+    Counter {
+        count: u32,
+        needed: u32,
+        per_element: [u32; 3],
+        per_block: [u32; 3],
+    }
+    ScanSetup {
+        count: u32,
+        counter_in: u32,
+        counter_out: u32,
+        capacity: u32,
+    }
+    SortSetup {
+        shift: u32,
+        counter: u32,
+        pad: [u32; 2],
+    }
+    TileListsSetup {
+        emit: u32,
+        pad: [u32; 3],
+    }
+    GatherSetup {
+        count: u32,
+        planes: u32,
+        capacity_in: u32,
+        capacity_out: u32,
+    }
+    LossSetup {
+        width: u32,
+        height: u32,
+        ssim_weight: f32,
+        depth_weight: f32,
+    }
+    /// Step sizes by plane and lane, and decay rates (`shaders/shared/sink_adam.wgsl`).
+    AdamSetup {
+        rates: [[f32; 4]; 5],
+        beta_1: f32,
+        beta_2: f32,
+        epsilon: f32,
+        log_beta_1: f32,
+        log_beta_2: f32,
+        pad: [f32; 3],
     }
 }
 

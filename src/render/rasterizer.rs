@@ -5,10 +5,8 @@
 
 use std::sync::Arc;
 
-use bytemuck::{Pod, Zeroable};
-
 use super::cloud::GpuCloud;
-use super::layout::{COUNTERS, Counter, PAIR_COUNTER, VISIBLE_COUNTER, View, ViewCamera};
+use super::layout::{COUNTERS, Counter, PAIR_COUNTER, TileListsSetup, VISIBLE_COUNTER, View, ViewCamera};
 use super::shaders;
 use super::sort::{Scan, ScanJob, ScanLength, Sort};
 use super::workspace::Workspace;
@@ -45,13 +43,6 @@ impl Rendered {
 pub struct ViewCounts {
     pub visible: u32,
     pub pairs: u32,
-}
-
-#[repr(C)]
-#[derive(Clone, Copy, Pod, Zeroable)]
-struct TileListsSetup {
-    emit: u32,
-    pad: [u32; 3],
 }
 
 #[derive(Debug)]
@@ -209,12 +200,22 @@ impl Rasterizer {
     /// Reads the counters of the last view; when its pairs did not fit, grows the buffers and returns `None`: repeat the step.
     pub fn finish(&mut self) -> Result<Option<ViewCounts>, GpuError> {
         let counters: Vec<Counter> = self.workspace.counters.read(&self.gpu, 0, COUNTERS as usize)?;
+        let counts = self.counts(&counters);
+        self.make_room(&counters)?;
+        Ok(counts)
+    }
+
+    /// What the counters of a view say; `None` where its pairs did not fit.
+    pub fn counts(&self, counters: &[Counter]) -> Option<ViewCounts> {
         let pairs = counters[PAIR_COUNTER as usize];
-        if pairs.needed as usize > self.workspace.pair_capacity {
-            self.workspace.reserve_pairs(&self.gpu, pairs.needed as usize + pairs.needed as usize / 4)?;
-            return Ok(None);
-        }
-        Ok(Some(ViewCounts { visible: counters[VISIBLE_COUNTER as usize].count, pairs: pairs.count }))
+        let fits = pairs.count == pairs.needed;
+        fits.then(|| ViewCounts { visible: counters[VISIBLE_COUNTER as usize].count, pairs: pairs.count })
+    }
+
+    /// Grows the pair buffers to what the counters of a view ask for.
+    pub fn make_room(&mut self, counters: &[Counter]) -> Result<(), GpuError> {
+        let needed = counters[PAIR_COUNTER as usize].needed as usize;
+        if needed > self.workspace.pair_capacity { self.workspace.reserve_pairs(&self.gpu, needed + needed / 4) } else { Ok(()) }
     }
 
     /// Renders a view and reads it back.

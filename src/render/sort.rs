@@ -1,8 +1,6 @@
 //! Scan and stable radix sort over the workspace's buffers.
 
-use bytemuck::{Pod, Zeroable};
-
-use super::layout::{Counter, SCAN_BLOCK};
+use super::layout::{Counter, SCAN_BLOCK, ScanSetup, SortSetup};
 use super::shaders;
 use super::workspace::Workspace;
 use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, workgroups};
@@ -10,15 +8,6 @@ use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, workgroups};
 /// `counter_in` of a scan whose length the host knows.
 const NO_COUNTER: u32 = u32::MAX;
 const DIGIT_BITS: u32 = 8;
-
-#[repr(C)]
-#[derive(Clone, Copy, Pod, Zeroable)]
-struct ScanSetup {
-    count: u32,
-    counter_in: u32,
-    counter_out: u32,
-    capacity: u32,
-}
 
 /// How long a scan is.
 #[derive(Clone, Copy, Debug)]
@@ -70,14 +59,6 @@ impl Scan {
         self.apply.dispatch(gpu, pass, &bindings, size);
         Ok(())
     }
-}
-
-#[repr(C)]
-#[derive(Clone, Copy, Pod, Zeroable)]
-struct SortSetup {
-    shift: u32,
-    counter: u32,
-    pad: [u32; 2],
 }
 
 #[derive(Debug)]
