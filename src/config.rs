@@ -87,13 +87,18 @@ pub enum ConfigError {
     Syntax { path: PathBuf, source: Box<toml::de::Error> },
     #[error("{0}")]
     Value(String),
+    #[error("{path}: {source}")]
+    In { path: PathBuf, source: Box<ConfigError> },
 }
 
 impl Config {
-    /// Reads a TOML file; keys that it leaves out keep their defaults, unknown ones are errors.
+    /// Reads and checks a TOML file; keys that it leaves out keep their defaults, unknown ones are errors.
     pub fn read(path: &Path) -> Result<Self, ConfigError> {
         let text = std::fs::read_to_string(path).map_err(|source| ConfigError::Read { path: path.into(), source })?;
-        toml::from_str(&text).map_err(|source| ConfigError::Syntax { path: path.into(), source: Box::new(source) })
+        let config: Self =
+            toml::from_str(&text).map_err(|source| ConfigError::Syntax { path: path.into(), source: Box::new(source) })?;
+        config.validate().map_err(|source| ConfigError::In { path: path.into(), source: Box::new(source) })?;
+        Ok(config)
     }
 
     /// Checks all values.

@@ -2,6 +2,6 @@
 
 mod cli;
 
-fn main() -> miette::Result<()> {
+fn main() -> std::process::ExitCode {
     cli::main()
 }

@@ -4,6 +4,7 @@
 mod common;
 
 use fastrand::Rng;
+use image::RgbImage;
 use keysplat::geometry::Pinhole;
 use keysplat::gpu::Gpu;
 use keysplat::optimise::{AdamConfig, LossConfig, Optimiser, TargetImage, TrainingView};
@@ -11,8 +12,8 @@ use keysplat::reference::adam::Adam64;
 use keysplat::reference::loss::{LossWeights, Target64, loss};
 use keysplat::reference::project_backward::backward;
 use keysplat::reference::{Cutoffs, Gaussian64, Image64, View64, cloud64, rasterize_forward};
-use keysplat::render::{GpuCloud, Rasterizer, ViewCamera};
-use keysplat::sequence::{DepthImage, RectifiedImage};
+use keysplat::render::{GpuCloud, Rasterizer};
+use keysplat::splat::ViewCamera;
 use keysplat::splat::{GaussianCloud, ShDegree};
 use nalgebra::Vector3;
 use std::sync::Arc;
@@ -96,9 +97,9 @@ fn random_scenes_agree() {
 }
 
 /// A target image for the loss, 8-bit like a real one.
-fn target(rng: &mut Rng, pinhole: Pinhole) -> (RectifiedImage, Target64) {
+fn target(rng: &mut Rng, pinhole: Pinhole) -> (RgbImage, Target64) {
     let (width, height) = (pinhole.width, pinhole.height);
-    let color = image::RgbImage::from_fn(width, height, |_, _| image::Rgb([rng.u8(..), rng.u8(..), rng.u8(..)]));
+    let color = RgbImage::from_fn(width, height, |_, _| image::Rgb([rng.u8(..), rng.u8(..), rng.u8(..)]));
     let metres: Vec<f32> = (0..width * height).map(|i| if i % 4 == 0 { 0.0 } else { common::between(rng, 0.5, 3.0) }).collect();
     let wide = Target64 {
         width: width as usize,
@@ -106,7 +107,12 @@ fn target(rng: &mut Rng, pinhole: Pinhole) -> (RectifiedImage, Target64) {
         color: color.pixels().map(|p| Vector3::from(p.0).map(|v| f64::from(v) / 255.0)).collect(),
         depth: metres.iter().map(|m| f64::from(*m)).collect(),
     };
-    (RectifiedImage { pinhole, color, depth: Some(DepthImage { width, height, metres }) }, wide)
+    (color, wide)
+}
+
+fn upload_target(gpu: &Gpu, image: &RgbImage, wide: &Target64) -> TargetImage {
+    let metres: Vec<f32> = wide.depth.iter().map(|m| *m as f32).collect();
+    TargetImage::new(gpu, image, Some(&metres)).unwrap()
 }
 
 #[test]
@@ -122,7 +128,7 @@ fn the_loss_and_its_whole_gradient_agree() {
         let mut rasterizer = Rasterizer::new(gpu.clone()).unwrap();
         let mut optimiser = Optimiser::new(&gpu).unwrap();
         let on_gpu = upload(&gpu, &cloud);
-        let image = TargetImage::new(&gpu, &image).unwrap();
+        let image = upload_target(&gpu, &image, &wide);
         let got = optimiser.gradients(&mut rasterizer, &on_gpu, &camera, &image, &config).unwrap();
         let view = View64 { background: Vector3::zeros(), ..view64(&camera) };
         let rendered = rasterize_forward::render(&view, &cloud64(&cloud));
@@ -149,7 +155,8 @@ fn adam_steps_agree() {
     let mut cloud = common::scene(&mut rng, 60, ShDegree::ALL[1]);
     // One that cannot be seen: it must not move.
     cloud.means[5].z = -1.0;
-    let image = TargetImage::new(&gpu, &target(&mut rng, camera.pinhole).0).unwrap();
+    let (image, wide) = target(&mut rng, camera.pinhole);
+    let image = upload_target(&gpu, &image, &wide);
     let mut rasterizer = Rasterizer::new(gpu.clone()).unwrap();
     let mut optimiser = Optimiser::new(&gpu).unwrap();
     let on_gpu = upload(&gpu, &cloud);
@@ -256,7 +263,8 @@ fn pairs_that_outgrow_their_buffers_are_never_dropped() {
     assert_eq!(first, rasterizer.render(&on_gpu, &camera, BACKGROUND).unwrap(), "rendering is repeatable to the bit");
 
     // Training: steps that did not fit are repeated, and all of them count.
-    let image = TargetImage::new(&gpu, &target(&mut rng, camera.pinhole).0).unwrap();
+    let (image, wide) = target(&mut rng, camera.pinhole);
+    let image = upload_target(&gpu, &image, &wide);
     let mut rasterizer = Rasterizer::new(gpu.clone()).unwrap();
     let views = [TrainingView { camera, target: &image }; 3];
     let configs = (&LossConfig::default(), &AdamConfig::default());

@@ -10,8 +10,8 @@ use nalgebra::Vector2;
 use crate::geometry::{Pinhole, Se3};
 use crate::gpu::{Gpu, GpuError};
 use crate::optimise::TargetImage;
-use crate::render::{GpuCloud, ViewCamera};
-use crate::sequence::{DepthImage, RectifiedImage};
+use crate::render::GpuCloud;
+use crate::splat::ViewCamera;
 use crate::splat::{Gaussian, GaussianCloud, ShDegree, raw_opacity_from_opacity};
 
 /// How often the Gaussians' footprints (one standard deviation) cover the image.
@@ -39,8 +39,7 @@ impl BenchScene {
         let mut on_gpu = GpuCloud::new(gpu, sh_degree, count)?;
         on_gpu.append(gpu, &cloud)?;
         let color = RgbImage::from_fn(width, height, |x, y| Rgb([(x * 7 + y) as u8, (y * 5) as u8, (x + y * 3) as u8]));
-        let depth = Some(DepthImage { width, height, metres: vec![2.0; (width * height) as usize] });
-        let target = TargetImage::new(gpu, &RectifiedImage { pinhole, color, depth })?;
+        let target = TargetImage::new(gpu, &color, Some(&vec![2.0; (width * height) as usize]))?;
         Ok(Self { cloud: on_gpu, camera: ViewCamera { pinhole, camera_from_world: Se3::identity() }, target })
     }
 }

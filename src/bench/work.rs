@@ -4,8 +4,9 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 use crate::gpu::GpuError;
-use crate::render::layout::{ALPHA_MAX, TILE_HEIGHT, TILE_WIDTH, TRANSMITTANCE_MIN, ViewCamera};
+use crate::render::layout::{TILE_HEIGHT, TILE_WIDTH};
 use crate::render::{GpuCloud, Rasterizer, ViewCounts};
+use crate::splat::model::{ALPHA_MAX, TRANSMITTANCE_MIN, ViewCamera};
 
 /// Counted work of one view.
 #[derive(Clone, Copy, Debug, Default, Serialize)]

@@ -2,14 +2,17 @@
 
 use keysplat::gpu;
 
+use super::print;
+
 /// Prints a line per adapter, the one that a run would choose first.
-pub fn adapters() {
+pub fn adapters() -> miette::Result<()> {
     let found = gpu::adapters();
     if found.is_empty() {
-        println!("no adapter; {}", gpu::GpuError::NoAdapter);
+        return print(&format!("{}\n", gpu::GpuError::NoAdapter));
     }
     for (i, a) in found.iter().enumerate() {
         let chosen = if i == 0 { "  (default)" } else { "" };
-        println!("{}  [{}, {}, {}]{chosen}", a.name, a.kind, a.backend, a.driver);
+        print(&format!("{}  [{}, {}, {}]{chosen}\n", a.name, a.kind, a.backend, a.driver))?;
     }
+    Ok(())
 }

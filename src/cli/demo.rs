@@ -9,7 +9,7 @@ use keysplat::config::{Config, SequenceConfig};
 use keysplat::sequence::synthetic::SceneConfig;
 use miette::IntoDiagnostic;
 
-use super::{Verbosity, generate, progress, run};
+use super::{Verbosity, generate, print, progress, run};
 
 const SCENE: &str = include_str!("../../sequences/demo.toml");
 /// The demo maps at half of its recorded size, which two cores without a GPU can do in a few minutes.
@@ -34,19 +34,21 @@ pub fn demo(args: &DemoArgs, verbosity: Verbosity) -> miette::Result<()> {
         generate::render(&scene, &recording, verbosity)?;
         std::fs::write(recording.join(DIGEST_FILE), scene.digest()).into_diagnostic()?;
     }
-    let sequence = Some(SequenceConfig { path: recording, layout: None, camera: None });
+    let sequence = Some(SequenceConfig { path: std::path::absolute(recording).into_diagnostic()?, layout: None, camera: None });
     let config = Config { sequence, map_scale: MAP_SCALE, ..Config::default() };
     let stop = Arc::new(AtomicBool::new(false));
     progress::stop_on_ctrl_c(&stop)?;
-    run::replay(&config, args.out.clone(), stop, verbosity)?;
-    if verbosity.shows_progress() {
-        println!(
-            "\nThe map is {}; open it in any viewer of Gaussian splats, SuperSplat for one.",
-            args.out.join("map.ply").display()
-        );
-        println!("Held-out views beside their renders are in {}.", args.out.join("views").display());
+    run::replay(config, args.out.clone(), stop, verbosity)?;
+    if !verbosity.shows_progress() {
+        return Ok(());
     }
-    Ok(())
+    let (map, views) = (args.out.join("map.ply"), args.out.join("views"));
+    print(&format!(
+        "\nThe map is {}; open it in any viewer of Gaussian splats, SuperSplat for one.\n\
+         Held-out views beside their renders are in {}.\n",
+        map.display(),
+        views.display()
+    ))
 }
 
 fn is_current(recording: &Path, scene: &SceneConfig) -> bool {

@@ -14,7 +14,7 @@ use keysplat::gpu::Gpu;
 use keysplat::pipeline::outputs::{self, Measured, Subject};
 use keysplat::sequence::Sequence;
 use keysplat::splat::GaussianCloud;
-use miette::{IntoDiagnostic, WrapErr};
+use miette::IntoDiagnostic;
 
 use super::{Verbosity, print_metrics, progress, run};
 
@@ -34,8 +34,17 @@ pub struct EvalArgs {
 }
 
 pub fn eval(args: &EvalArgs, verbosity: Verbosity) -> miette::Result<()> {
-    let config = resolve(args)?;
-    let sequence = run::open(&config)?;
+    for name in [outputs::TRAJECTORY, outputs::MAP] {
+        if !args.dir.join(name).is_file() {
+            miette::bail!(
+                "there is no file {}; give a run's folder, with trajectory.txt and map.ply",
+                args.dir.join(name).display()
+            );
+        }
+    }
+    let mut config = resolve(args)?;
+    let sequence = run::open(&mut config)?;
+    let earlier = earlier_metrics(args)?;
     let trajectory = Trajectory::read_tum(&args.dir.join(outputs::TRAJECTORY)).into_diagnostic()?;
     let keyframes_file = args.dir.join(outputs::KEYFRAMES);
     let keyframes =
@@ -43,9 +52,16 @@ pub fn eval(args: &EvalArgs, verbosity: Verbosity) -> miette::Result<()> {
     let map_file = args.dir.join(outputs::MAP);
     let cloud = MapFormat::Ply.read(&map_file).into_diagnostic()?;
     let map_bytes = std::fs::read(&map_file).into_diagnostic()?;
-    outputs::prepare_folder(&args.dir).into_diagnostic()?;
-    let gpu = Gpu::open(config.adapter.as_deref()).into_diagnostic()?;
     let poses = frames_of(&sequence, &trajectory);
+    if poses.is_empty() {
+        miette::bail!(
+            "no pose of {} is within {MAX_TIME_DIFFERENCE_S} s of a frame of {}; name the right recording with --sequence",
+            args.dir.join(outputs::TRAJECTORY).display(),
+            sequence.name
+        );
+    }
+    let gpu = Gpu::open(config.adapter.as_deref()).into_diagnostic()?;
+    outputs::prepare_folder(&args.dir).into_diagnostic()?;
     let subject = Subject {
         trajectory: &trajectory,
         keyframe_indices: frames_of(&sequence, &keyframes).into_iter().map(|(index, _)| index).collect::<BTreeSet<usize>>(),
@@ -56,7 +72,7 @@ pub fn eval(args: &EvalArgs, verbosity: Verbosity) -> miette::Result<()> {
     let bar = progress::bar(verbosity, subject.poses.len() as u64, "{wide_bar} {pos}/{len} views compared");
     let measured = outputs::measure((&sequence, &config), &gpu, &subject, &args.dir, &|done| bar.set_position(done as u64));
     bar.finish_and_clear();
-    let mut metrics = earlier_metrics(args)?.unwrap_or_else(|| foreign_metrics(&sequence, &config));
+    let mut metrics = earlier.unwrap_or_else(|| foreign_metrics(&sequence, &config));
     fill(&mut metrics, measured.into_diagnostic()?, &cloud, &map_bytes);
     metrics.frames_tracked = subject.poses.len() as u64;
     metrics.keyframes = (!subject.keyframes.poses.is_empty()).then_some(subject.keyframes.poses.len() as u64);
@@ -101,8 +117,9 @@ fn earlier_metrics(args: &EvalArgs) -> miette::Result<Option<Metrics>> {
         return Ok(None);
     }
     let text = std::fs::read_to_string(&path).into_diagnostic()?;
-    let metrics = serde_json::from_str(&text).into_diagnostic();
-    metrics.map(Some).wrap_err_with(|| format!("{} is not ours; move it away to have it written anew", path.display()))
+    serde_json::from_str(&text).map(Some).map_err(|error| {
+        miette::miette!("{} is not this version's ({error}); move it away to have it written anew", path.display())
+    })
 }
 
 /// Figures of a run that somebody else made: what the folder cannot tell stays empty.

@@ -8,8 +8,11 @@ mod generate;
 mod progress;
 mod run;
 
+use std::io::{ErrorKind, IsTerminal, Write};
+use std::process::ExitCode;
+
 use clap::{Parser, Subcommand, ValueEnum};
-use miette::IntoDiagnostic;
+use miette::{IntoDiagnostic, MietteHandlerOpts};
 use tracing_subscriber::EnvFilter;
 
 /// Replays recorded image sequences into a camera trajectory and a photorealistic Gaussian map.
@@ -63,27 +66,41 @@ impl Verbosity {
     }
 }
 
-pub fn main() -> miette::Result<()> {
+pub fn main() -> ExitCode {
     let cli = Cli::parse();
     let verbosity = Verbosity { quiet: cli.quiet, json: cli.log == LogFormat::Json };
-    start_log(verbosity)?;
-    match cli.command {
+    match start_log(verbosity).and_then(|()| execute(cli.command, verbosity)) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(report) if verbosity.json => {
+            tracing::error!("{report}");
+            ExitCode::FAILURE
+        }
+        Err(report) => {
+            eprintln!("Error: {report:?}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn execute(command: Command, verbosity: Verbosity) -> miette::Result<()> {
+    match command {
         Command::Run(args) => run::run(args, verbosity),
         Command::Demo(args) => demo::demo(&args, verbosity),
         Command::Generate(args) => generate::generate(&args, verbosity),
         Command::Eval(args) => eval::eval(&args, verbosity),
         Command::Bench(args) => bench::bench(&args),
-        Command::Adapters => {
-            adapters::adapters();
-            Ok(())
-        }
+        Command::Adapters => adapters::adapters(),
     }
 }
 
 fn start_log(verbosity: Verbosity) -> miette::Result<()> {
+    // Our messages name their causes themselves; wrapped lines would tear paths and file:line apart.
+    let report = |_: &_| Box::new(MietteHandlerOpts::new().wrap_lines(false).without_cause_chain().build()) as Box<_>;
+    miette::set_hook(Box::new(report)).into_diagnostic()?;
     let level = if verbosity.quiet { "error" } else { "keysplat=info,warn" };
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(level));
     let log = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).with_target(false);
+    let log = log.with_ansi(std::io::stderr().is_terminal());
     if verbosity.json { log.json().try_init() } else { log.without_time().try_init() }.map_err(|e| miette::miette!("{e}"))?;
     // A panic of a worker thread is reported once, where it is joined.
     let default_hook = std::panic::take_hook();
@@ -100,9 +117,19 @@ fn start_log(verbosity: Verbosity) -> miette::Result<()> {
 /// Prints figures on standard output, in the form that was asked for.
 fn print_metrics(metrics: &keysplat::evaluation::Metrics, verbosity: Verbosity) -> miette::Result<()> {
     if verbosity.json {
-        println!("{}", serde_json::to_string(metrics).into_diagnostic()?);
+        print(&format!("{}\n", serde_json::to_string(metrics).into_diagnostic()?))
     } else if !verbosity.quiet {
-        print!("{metrics}");
+        print(&metrics.to_string())
+    } else {
+        Ok(())
     }
-    Ok(())
+}
+
+/// Prints on standard output. A reader that has gone, as `head` does, has read enough.
+fn print(text: &str) -> miette::Result<()> {
+    let mut out = std::io::stdout().lock();
+    match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
+        Err(error) if error.kind() != ErrorKind::BrokenPipe => miette::bail!("cannot write to standard output: {error}"),
+        _ => Ok(()),
+    }
 }

@@ -24,7 +24,7 @@ pub fn stop_on_ctrl_c(stop: &Arc<AtomicBool>) -> miette::Result<()> {
         if stop.swap(true, Ordering::Relaxed) {
             std::process::exit(130);
         }
-        eprintln!("finishing with what there is; press Ctrl-C again to quit at once");
+        tracing::warn!("finishing with what there is; press Ctrl-C again to quit at once");
     })
     .into_diagnostic()
 }

@@ -1,6 +1,6 @@
 //! `keysplat run`
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -9,9 +9,9 @@ use clap::Args;
 use indicatif::ProgressBar;
 use keysplat::config::{Config, SequenceConfig};
 use keysplat::gpu::Gpu;
-use keysplat::pipeline::{self, Outcome, Progress, outputs};
+use keysplat::pipeline::{self, Outcome, PipelineError, Progress, outputs};
 use keysplat::sequence::{Layout, Sequence};
-use miette::{IntoDiagnostic, WrapErr, miette};
+use miette::{IntoDiagnostic, miette};
 
 use super::{Verbosity, print_metrics, progress};
 
@@ -60,7 +60,9 @@ impl RunArgs {
     fn resolve(&self) -> miette::Result<Config> {
         let mut config = self.config.as_deref().map_or_else(|| Ok(Config::default()), Config::read).into_diagnostic()?;
         if let Some(path) = &self.sequence {
-            config.sequence = Some(SequenceConfig { path: path.clone(), layout: None, camera: None });
+            // Absolute, so that the written configuration finds it from anywhere.
+            let path = std::path::absolute(path).into_diagnostic()?;
+            config.sequence = Some(SequenceConfig { path, layout: None, camera: None });
         }
         let sequence = config
             .sequence
@@ -82,23 +84,29 @@ pub fn run(args: RunArgs, verbosity: Verbosity) -> miette::Result<()> {
     let config = args.resolve()?;
     let stop = Arc::new(AtomicBool::new(false));
     progress::stop_on_ctrl_c(&stop)?;
-    replay(&config, args.out, stop, verbosity)
+    replay(config, args.out, stop, verbosity)
 }
 
-/// Opens the recording that a configuration names, with its selection of frames.
-pub fn open(config: &Config) -> miette::Result<Sequence> {
+/// Opens the recording that a configuration names, with its selection of frames. A range that goes on beyond the recording then
+/// ends with it.
+pub fn open(config: &mut Config) -> miette::Result<Sequence> {
     let named = config.sequence.as_ref().ok_or_else(|| miette!("the configuration names no recording"))?;
     let mut sequence = Sequence::open(&named.path, named.layout, named.camera.as_deref()).into_diagnostic()?;
+    let recorded = sequence.entries.len();
     let range = config.replay.frames.map(|(start, end)| start..end);
     sequence.select(range, config.replay.every).into_diagnostic()?;
+    config.replay.frames = config.replay.frames.map(|(start, end)| (start, end.min(recorded)));
+    pipeline::check_size(&sequence, config.map_scale).into_diagnostic()?;
     Ok(sequence)
 }
 
 /// Replays, writes everything, measures, prints. What was made is written before an error is reported.
-pub fn replay(config: &Config, out: PathBuf, stop: Arc<AtomicBool>, verbosity: Verbosity) -> miette::Result<()> {
-    let sequence = open(config)?;
-    outputs::prepare_folder(&out).into_diagnostic()?;
+pub fn replay(mut config: Config, out: PathBuf, stop: Arc<AtomicBool>, verbosity: Verbosity) -> miette::Result<()> {
+    let sequence = open(&mut config)?;
+    let config = &config;
+    pipeline::check_first_depth(&sequence).into_diagnostic()?;
     let gpu = Gpu::open(config.adapter.as_deref()).into_diagnostic()?;
+    outputs::prepare_folder(&out).into_diagnostic()?;
     tracing::info!(
         sequence = sequence.name,
         frames = sequence.entries.len(),
@@ -118,21 +126,45 @@ pub fn replay(config: &Config, out: PathBuf, stop: Arc<AtomicBool>, verbosity: V
     })
     .into_diagnostic()?;
     let error = outcome.error.take();
-    let map = outputs::write_results(&out, &outcome, config).into_diagnostic()?;
-    if !outcome.poses.is_empty() {
-        let bar = progress::bar(verbosity, outcome.poses.len() as u64, "{wide_bar} {pos}/{len} views compared");
-        let measured =
-            outputs::measure((&sequence, config), &gpu, &subject(&outcome), &out, &|done| bar.set_position(done as u64));
-        bar.finish_and_clear();
-        let measured = measured.into_diagnostic()?;
-        let metrics = outputs::write_metrics((&sequence, config), &gpu, &outcome, (measured, map), &out).into_diagnostic()?;
-        print_metrics(&metrics, verbosity)?;
+    if outcome.poses.is_empty() {
+        return nothing_made(error, windows.stopped());
     }
+    let finished = write_and_measure((&sequence, config), &gpu, &outcome, &out, verbosity);
+    match (error, finished) {
+        (None, finished) => finished,
+        (Some(error), Ok(())) => Err(miette!("{error}\nThe run ended early; what there was until then is in {}", out.display())),
+        (Some(error), Err(then)) => Err(miette!("{error}\nThe run ended early, and then: {then}")),
+    }
+}
+
+fn write_and_measure(
+    (sequence, config): (&Sequence, &Config),
+    gpu: &Arc<Gpu>,
+    outcome: &Outcome,
+    out: &Path,
+    verbosity: Verbosity,
+) -> miette::Result<()> {
+    let map = outputs::write_results(out, outcome, config).into_diagnostic()?;
+    let bar = progress::bar(verbosity, outcome.poses.len() as u64, "{wide_bar} {pos}/{len} views compared");
+    let measured = outputs::measure((sequence, config), gpu, &subject(outcome), out, &|done| bar.set_position(done as u64));
+    bar.finish_and_clear();
+    let measured = measured.into_diagnostic()?;
+    let metrics = outputs::write_metrics((sequence, config), gpu, outcome, (measured, map), out).into_diagnostic()?;
+    print_metrics(&metrics, verbosity)
+}
+
+/// Without a pose there is no trajectory, no map and no figure; what an earlier run left in the folder stays.
+fn nothing_made(error: Option<PipelineError>, stopped: bool) -> miette::Result<()> {
     match error {
-        None => Ok(()),
-        Some(error) => {
-            Err(error).into_diagnostic().wrap_err_with(|| format!("the run ended early; what there was is in {}", out.display()))
+        Some(error) => Err(miette!("{error}")),
+        None if stopped => {
+            tracing::warn!("stopped before a frame was tracked, so nothing was written");
+            Ok(())
         }
+        None => Err(miette!(
+            "not one frame could be tracked; the images need texture, and depth between tracking.min_depth_metres and \
+             tracking.max_depth_metres"
+        )),
     }
 }
 

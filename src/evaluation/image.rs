@@ -11,7 +11,8 @@ use ::image::RgbImage;
 
 /// The window reaches this many pixels to each side: `int(3.5 σ + 0.5)` for σ = 1.5.
 const RADIUS: usize = 5;
-const WINDOW: usize = 2 * RADIUS + 1;
+/// Side of SSIM's window: no smaller image can be compared.
+pub const WINDOW: usize = 2 * RADIUS + 1;
 const SIGMA_PIXELS: f64 = 1.5;
 /// (K₁ L)² and (K₂ L)² of the paper, for a data range L of 1.
 const C1: f64 = 0.01 * 0.01;

@@ -275,9 +275,9 @@ impl fmt::Display for Adapter {
 mod tests {
     use super::*;
 
-    /// The example of the protocol, field for field.
+    /// The example of the protocol, field for field, and the two counts of a paced replay that it leaves out.
     const EXAMPLE: &str = r#"{ "sequence": "redkitchen", "sensor": "rgbd", "paced": false, "frames": 600, "frames_read_failed": 0,
-      "frames_tracked": 600, "keyframes": 61,
+      "frames_tracked": 600, "frames_late": 0, "keyframes_deferred": 0, "keyframes": 61,
       "ate_rmse_m": {"all_frames": 0.01, "keyframes": 0.01}, "rpe": {"trans_m_per_frame": 0.002, "rot_deg_per_frame": 0.1},
       "images": {"held_out":   {"count": 75, "psnr_db": 24.0, "ssim": 0.85, "depth_l1_m": 0.02},
                  "all_frames": {"count": 600, "psnr_db": 24.5, "ssim": 0.86, "depth_l1_m": 0.02},

@@ -12,9 +12,10 @@ use super::image::{ImageF32, depth_l1, psnr, psnr_where_lit, ssim};
 use super::metrics::{ImageMeans, ImageProtocols};
 use crate::geometry::Se3;
 use crate::gpu::{Gpu, GpuError};
-use crate::render::{GpuCloud, Rasterizer, Rendered, ViewCamera};
+use crate::render::{GpuCloud, Rasterizer, Rendered};
 use crate::sequence::{RectifiedImage, Rectifier, Sequence};
 use crate::splat::GaussianCloud;
+use crate::splat::ViewCamera;
 
 /// MonoGS compares every 5th frame.
 const MONOGS_EVERY: usize = 5;

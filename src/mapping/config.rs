@@ -116,7 +116,7 @@ impl MappingConfig {
     /// Says what is wrong with the values, if anything.
     pub fn validate(&self) -> Result<(), String> {
         let s = &self.seeding;
-        if s.stride == 0 || s.flat_stride < s.stride || s.flat_stride % s.stride != 0 {
+        if s.stride == 0 || s.flat_stride < s.stride || !s.flat_stride.is_multiple_of(s.stride) {
             return Err("mapping.seeding.flat_stride must be a multiple of mapping.seeding.stride, both at least 1".into());
         }
         let shares = [

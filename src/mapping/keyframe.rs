@@ -3,8 +3,8 @@
 use crate::geometry::Se3;
 use crate::gpu::{Gpu, GpuError};
 use crate::optimise::TargetImage;
-use crate::render::ViewCamera;
 use crate::sequence::RectifiedImage;
+use crate::splat::ViewCamera;
 
 /// The tracker's number of a keyframe.
 pub type KeyframeId = usize;
@@ -30,10 +30,11 @@ pub(super) struct MappedKeyframe {
 
 impl MappedKeyframe {
     pub fn new(gpu: &Gpu, keyframe: &Keyframe) -> Result<Self, GpuError> {
+        let depth = keyframe.image.depth.as_ref().map(|d| d.metres.as_slice());
         Ok(Self {
             id: keyframe.id,
             camera: ViewCamera { pinhole: keyframe.image.pinhole, camera_from_world: keyframe.world_from_camera.inverse() },
-            target: TargetImage::new(gpu, &keyframe.image)?,
+            target: TargetImage::new(gpu, &keyframe.image.color, depth)?,
             covisible: keyframe.covisible.clone(),
         })
     }

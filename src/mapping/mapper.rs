@@ -11,8 +11,9 @@ use super::{Keyframe, KeyframeId, MappingConfig, prune, seeding};
 use crate::geometry::Se3;
 use crate::gpu::{Gpu, GpuError};
 use crate::optimise::{Optimiser, StepReport, TrainingView};
-use crate::render::{GpuCloud, Rasterizer, Rendered, ViewCamera};
+use crate::render::{GpuCloud, Rasterizer, Rendered};
 use crate::splat::GaussianCloud;
+use crate::splat::ViewCamera;
 
 const FIRST_CAPACITY: usize = 32_768;
 /// Steps submitted at once: the GPU never waits for the host between them, and a stop is heeded between batches.

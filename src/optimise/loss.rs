@@ -1,9 +1,9 @@
 //! What a view should look like, and the weights of the loss.
 
+use image::RgbImage;
 use serde::{Deserialize, Serialize};
 
 use crate::gpu::{Gpu, GpuBuffer, GpuError};
-use crate::sequence::RectifiedImage;
 
 /// Weights of the image loss `(1-λ)·L1 + λ·(1-SSIM) + λ_depth·L1(depth)`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -78,15 +78,16 @@ pub struct TargetImage {
 }
 
 impl TargetImage {
-    /// Uploads a rectified image; pixels without depth do not enter the depth loss.
-    pub fn new(gpu: &Gpu, image: &RectifiedImage) -> Result<Self, GpuError> {
-        let (width, height) = image.color.dimensions();
-        let packed: Vec<u32> = image.color.pixels().map(|p| u32::from_le_bytes([p.0[0], p.0[1], p.0[2], 255])).collect();
+    /// Uploads an image and, where the sensor has one, its depth `[H * W]` in metres; pixels at 0 do not enter the depth loss.
+    pub fn new(gpu: &Gpu, image: &RgbImage, depth_metres: Option<&[f32]>) -> Result<Self, GpuError> {
+        let (width, height) = image.dimensions();
+        let packed: Vec<u32> = image.pixels().map(|p| u32::from_le_bytes([p.0[0], p.0[1], p.0[2], 255])).collect();
         let color = GpuBuffer::storage(gpu, "target colour", packed.len() as u64 * 4)?;
         color.write(gpu, 0, &packed);
         let depth = GpuBuffer::storage(gpu, "target depth", packed.len() as u64 * 4)?;
-        if let Some(measured) = &image.depth {
-            depth.write(gpu, 0, &measured.metres);
+        if let Some(metres) = depth_metres {
+            assert_eq!(metres.len(), packed.len(), "depth has the size of the image");
+            depth.write(gpu, 0, metres);
         }
         Ok(Self { width, height, color, depth })
     }

@@ -4,9 +4,9 @@ use bytemuck::{Pod, Zeroable};
 
 use super::{AdamConfig, LossConfig, LossTerms, TargetImage};
 use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, workgroups};
-use crate::render::layout::{AdamSetup, COUNTERS, Counter, LossSetup, VISIBLE_COUNTER, View, ViewCamera};
+use crate::render::layout::{AdamSetup, COUNTERS, Counter, LossSetup, VISIBLE_COUNTER, View};
 use crate::render::{GpuCloud, PreparedView, Rasterizer, ViewCounts, cloud_from_planes, shaders};
-use crate::splat::GaussianCloud;
+use crate::splat::{GaussianCloud, ViewCamera};
 
 const LOSS_TILE: u32 = 16;
 

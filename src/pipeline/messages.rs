@@ -1,6 +1,7 @@
 //! What the threads tell each other, and how they fail.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -21,7 +22,17 @@ pub enum PipelineError {
     Panicked { thread: &'static str, message: String },
     #[error("the {thread} thread could not be started: {source}")]
     Spawn { thread: &'static str, source: std::io::Error },
-    #[error("not one of the {frames} frames could be read; the first one failed so: {first}")]
+    #[error(
+        "the first frame, {color}, has no depth image near its time; the map is started from depth: give the recording's depth (depth.txt), or begin at a frame that has one with --frames"
+    )]
+    NoFirstDepth { color: PathBuf },
+    #[error(
+        "images would be mapped at {width}x{height}, but the least is {least}x{least}; raise the mapping resolution (--map-scale)"
+    )]
+    TooSmall { width: u32, height: u32, least: u32 },
+    #[error(
+        "not one of the {frames} frames could be read; the first one failed so: {first}; check that the recording was copied whole"
+    )]
     NothingRead { frames: usize, first: String },
 }
 
@@ -57,7 +68,8 @@ impl Default for Progress {
 }
 
 impl Progress {
-    pub(super) fn stopped(&self) -> bool {
+    /// Whether the run was asked to end early.
+    pub fn stopped(&self) -> bool {
         self.stop.load(Ordering::Relaxed)
     }
 }

@@ -16,4 +16,4 @@ mod run;
 mod track_thread;
 
 pub use messages::{MapperMessage, PipelineError, Progress};
-pub use run::{Outcome, run};
+pub use run::{Outcome, check_first_depth, check_size, run};

@@ -32,6 +32,8 @@ const MAX_PICTURES: usize = 100;
 pub enum OutputError {
     #[error("cannot create the output folder {path}: {source}; choose another with --out")]
     Folder { path: PathBuf, source: std::io::Error },
+    #[error("cannot remove {path}, which is of an earlier run: {source}; choose another folder with --out")]
+    Remove { path: PathBuf, source: std::io::Error },
     #[error("cannot encode {path}: {source}")]
     Picture { path: PathBuf, source: image::ImageError },
     #[error(transparent)]
@@ -49,6 +51,23 @@ pub fn prepare_folder(out: &Path) -> Result<(), OutputError> {
         .map_err(|source| OutputError::Folder { path: out.into(), source })
 }
 
+fn remove_file(path: &Path) -> Result<(), OutputError> {
+    match std::fs::remove_file(path) {
+        Err(source) if source.kind() != std::io::ErrorKind::NotFound => Err(OutputError::Remove { path: path.into(), source }),
+        _ => Ok(()),
+    }
+}
+
+/// Removes an earlier run's pictures, and nothing else that may lie beside them.
+fn remove_pictures(out: &Path) -> Result<(), OutputError> {
+    let Ok(entries) = std::fs::read_dir(out.join(VIEWS)) else { return Ok(()) };
+    let is_ours = |name: &str| name.strip_suffix(".png").is_some_and(|n| n.len() >= 6 && n.bytes().all(|b| b.is_ascii_digit()));
+    for entry in entries.filter_map(Result::ok).filter(|entry| entry.file_name().to_str().is_some_and(is_ours)) {
+        remove_file(&entry.path())?;
+    }
+    Ok(())
+}
+
 /// Size and hash of a written map.
 #[derive(Clone, Debug)]
 pub struct WrittenMap {
@@ -56,8 +75,10 @@ pub struct WrittenMap {
     pub hash: String,
 }
 
-/// Writes what the replay made: trajectories, map, and the configuration that made them.
+/// Writes what the replay made: trajectories, map, and the configuration that made them. Figures of an earlier run in the same
+/// folder go first: they would belong to another map.
 pub fn write_results(out: &Path, outcome: &Outcome, config: &Config) -> Result<WrittenMap, OutputError> {
+    remove_file(&out.join(METRICS))?;
     write_atomically(&out.join(TRAJECTORY), outcome.trajectory.to_tum().as_bytes())?;
     write_atomically(&out.join(KEYFRAMES), outcome.keyframe_trajectory().to_tum().as_bytes())?;
     write_atomically(&out.join(CONFIG), config.to_toml().as_bytes())?;
@@ -90,6 +111,7 @@ pub fn measure(
     out: &Path,
     progress: &dyn Fn(usize),
 ) -> Result<Measured, OutputError> {
+    remove_pictures(out)?;
     let truth = sequence.groundtruth.as_ref();
     let errors = |estimate: &Trajectory| truth.and_then(|truth| evaluate_trajectory(truth, estimate, Alignment::Rigid).ok());
     let (all, keyframes) = (errors(subject.trajectory), errors(&subject.keyframes));

@@ -12,6 +12,7 @@ use super::read_thread::{self, ReadSummary};
 use super::track_thread::{self, TrackSummary};
 use super::{PipelineError, Progress};
 use crate::config::Config;
+use crate::evaluation::image::WINDOW as SSIM_WINDOW;
 use crate::geometry::{StampedPose, Trajectory};
 use crate::gpu::Gpu;
 use crate::mapping::KeyframeReport;
@@ -47,6 +48,21 @@ impl Outcome {
     pub fn keyframe_trajectory(&self) -> Trajectory {
         Trajectory { poses: self.keyframes.iter().map(KeyframePose::stamped).collect() }
     }
+}
+
+/// Says before any work whether a map could be started from this sequence.
+pub fn check_first_depth(sequence: &Sequence) -> Result<(), PipelineError> {
+    match sequence.entries.first() {
+        Some(first) if first.depth.is_none() => Err(PipelineError::NoFirstDepth { color: first.color.clone() }),
+        _ => Ok(()),
+    }
+}
+
+/// Says before any work whether images at the mapping resolution are large enough to be compared.
+pub fn check_size(sequence: &Sequence, map_scale: f64) -> Result<(), PipelineError> {
+    let pinhole = sequence.camera.pinhole.scaled(map_scale);
+    let (width, height, least) = (pinhole.width, pinhole.height, SSIM_WINDOW as u32);
+    if width.min(height) < least { Err(PipelineError::TooSmall { width, height, least }) } else { Ok(()) }
 }
 
 /// Replays a sequence. Errors that end it early are in the outcome, beside what was made until then.

@@ -11,8 +11,7 @@ pub mod spherical_harmonics;
 
 use nalgebra::{Vector2, Vector3, Vector4};
 
-use crate::render::ViewCamera;
-use crate::splat::{GaussianCloud, ShDegree};
+use crate::splat::{GaussianCloud, ShDegree, ViewCamera};
 
 /// One Gaussian's raw parameters; also its gradient, which has the same shape.
 #[derive(Clone, Debug, PartialEq)]

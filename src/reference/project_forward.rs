@@ -3,7 +3,7 @@
 use nalgebra::{Matrix2, Matrix2x3, Matrix3, Vector2, Vector3, Vector4};
 
 use super::{Cutoffs, Gaussian64, View64, spherical_harmonics};
-use crate::render::layout;
+use crate::splat::model;
 
 /// What the rasterizer needs of a Gaussian, and what the backward pass wants to see again.
 #[derive(Clone, Debug)]
@@ -53,22 +53,22 @@ pub fn project(view: &View64, g: &Gaussian64) -> Option<Projected64> {
     let rotation = camera_rotation(view);
     let p_in_camera = rotation * g.mean + camera.camera_from_world.translation.vector;
     let opacity = 1.0 / (1.0 + (-g.raw_opacity).exp());
-    let visible_depth = p_in_camera.z > layout::NEAR_METRES && p_in_camera.z < layout::FAR_METRES;
-    if !visible_depth || g.rotation.norm_squared() < layout::MIN_QUATERNION_NORM_SQUARED {
+    let visible_depth = p_in_camera.z > model::NEAR_METRES && p_in_camera.z < model::FAR_METRES;
+    if !visible_depth || g.rotation.norm_squared() < model::MIN_QUATERNION_NORM_SQUARED {
         return None;
     }
-    if view.cutoffs == Cutoffs::Sharp && opacity < layout::ALPHA_MIN {
+    if view.cutoffs == Cutoffs::Sharp && opacity < model::ALPHA_MIN {
         return None;
     }
     let axes = rotation * rotation_matrix(&g.rotation.normalize()) * Matrix3::from_diagonal(&g.log_scale.map(f64::exp));
     let z = p_in_camera.z;
-    let bounds = layout::tangent_bounds(p);
+    let bounds = model::tangent_bounds(p);
     let tangent = Vector2::new(p_in_camera.x / z, p_in_camera.y / z);
     let clamped = Vector2::new(tangent.x.clamp(bounds[0], bounds[1]), tangent.y.clamp(bounds[2], bounds[3]));
     let jacobian = Matrix2x3::new(p.fx / z, 0.0, -p.fx * clamped.x / z, 0.0, p.fy / z, -p.fy * clamped.y / z);
     let t = jacobian * axes;
-    let covariance = t * t.transpose() + Matrix2::identity() * layout::DILATION;
-    if !(covariance.determinant() >= layout::MIN_DETERMINANT && covariance.determinant() < 1e30) {
+    let covariance = t * t.transpose() + Matrix2::identity() * model::DILATION;
+    if !(covariance.determinant() >= model::MIN_DETERMINANT && covariance.determinant() < 1e30) {
         return None;
     }
     let offset = g.mean - camera.camera_from_world.inverse().translation.vector;
@@ -81,7 +81,7 @@ pub fn project(view: &View64, g: &Gaussian64) -> Option<Projected64> {
         conic: covariance.try_inverse()?,
         opacity,
         color: unclamped_color.map(|c| c.max(0.0)),
-        cut: (opacity / layout::ALPHA_MIN).ln(),
+        cut: (opacity / model::ALPHA_MIN).ln(),
         p_in_camera,
         jacobian,
         axes,

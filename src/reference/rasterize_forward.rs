@@ -4,7 +4,7 @@ use nalgebra::{Vector2, Vector3};
 
 use super::project_forward::{Projected64, project};
 use super::{Cutoffs, Gaussian64, Image64, View64};
-use crate::render::layout;
+use crate::splat::model;
 
 /// The projected Gaussians with their indices, nearest first; ties keep the order of the map.
 pub fn sorted(view: &View64, cloud: &[Gaussian64]) -> Vec<(usize, Projected64)> {
@@ -37,12 +37,12 @@ pub(super) fn contributions(view: &View64, sorted: &[(usize, Projected64)], x: u
             continue;
         }
         let raw = g.opacity * power.exp();
-        let alpha = raw.min(layout::ALPHA_MAX);
+        let alpha = raw.min(model::ALPHA_MAX);
         let next = transmittance * (1.0 - alpha);
-        if view.cutoffs == Cutoffs::Sharp && next < layout::TRANSMITTANCE_MIN {
+        if view.cutoffs == Cutoffs::Sharp && next < model::TRANSMITTANCE_MIN {
             break;
         }
-        found.push(Contribution { index, alpha, capped: raw > layout::ALPHA_MAX, offset, transmittance });
+        found.push(Contribution { index, alpha, capped: raw > model::ALPHA_MAX, offset, transmittance });
         transmittance = next;
     }
     (found, transmittance)

@@ -8,7 +8,6 @@ mod sort;
 mod workspace;
 
 pub use cloud::{GpuCloud, cloud_from_planes};
-pub use layout::ViewCamera;
 pub use rasterizer::{PreparedView, Rasterizer, Rendered, ViewCounts};
 pub use shaders::{SHADERS, ShaderSource};
 pub use workspace::Workspace;

@@ -6,11 +6,12 @@
 use std::sync::Arc;
 
 use super::cloud::GpuCloud;
-use super::layout::{COUNTERS, Counter, PAIR_COUNTER, TileListsSetup, VISIBLE_COUNTER, View, ViewCamera};
+use super::layout::{COUNTERS, Counter, PAIR_COUNTER, TileListsSetup, VISIBLE_COUNTER, View};
 use super::shaders;
 use super::sort::{Scan, ScanJob, ScanLength, Sort};
 use super::workspace::Workspace;
 use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, workgroups};
+use crate::splat::ViewCamera;
 
 /// Depth keys are whole f32.
 const DEPTH_KEY_BITS: u32 = 32;

@@ -27,6 +27,14 @@ pub enum Layout {
 impl Layout {
     pub const ALL: [Self; 1] = [Self::Tum];
 
+    /// The layouts with their marker files, for messages.
+    fn known() -> String {
+        let of = |layout: Self| match layout {
+            Self::Tum => "tum: has rgb.txt",
+        };
+        Self::ALL.map(of).join(", ")
+    }
+
     /// The layout whose marker files are in `folder`.
     fn recognise(folder: &Path) -> Option<Self> {
         Self::ALL.into_iter().find(|layout| match layout {
@@ -85,7 +93,7 @@ pub struct Sequence {
 pub enum SequenceError {
     #[error("there is no folder {0}; give the folder that holds the recording")]
     Missing(PathBuf),
-    #[error("{0} has no layout that we know ({known}); name one with --layout", known = Layout::ALL.map(|l| format!("{l:?}").to_lowercase()).join(", "))]
+    #[error("{0} is no recording in a layout that we know ({known}); check the folder, or name its layout with --layout", known = Layout::known())]
     UnknownLayout(PathBuf),
     #[error("cannot read {path}: {source}")]
     Read { path: PathBuf, source: std::io::Error },
@@ -105,7 +113,7 @@ pub enum SequenceError {
     Image { path: PathBuf, source: image::ImageError },
     #[error("{path} is no 16-bit grey image; depth must be one")]
     DepthFormat { path: PathBuf },
-    #[error("frames {start}..{end} is outside the sequence of {len} frames")]
+    #[error("frames {start}..{end} is outside the sequence of {len} frames; give --frames A..B within 0..{len}")]
     Range { start: usize, end: usize, len: usize },
     #[error(transparent)]
     Groundtruth(#[from] TrajectoryError),

@@ -1,11 +1,13 @@
 //! The map: Gaussians as a structure of arrays, spherical harmonics, and immutable snapshots for everyone but the mapper.
 
+pub mod model;
 pub mod sh;
 
 use std::sync::Arc;
 
 use glam::{Quat, Vec3};
 
+pub use model::ViewCamera;
 pub use sh::ShDegree;
 
 /// Gaussians, structure of arrays; all arrays have the same number of Gaussians. Raw parameters are what the optimiser moves;

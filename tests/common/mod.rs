@@ -1,11 +1,13 @@
-//! Random scenes that the gradient tests share.
+//! What test binaries share: random scenes for the gradient tests, and a tiny recording for those of the whole program.
 #![allow(dead_code, reason = "each test binary uses its own part")]
+
+pub mod recording;
 
 use fastrand::Rng;
 use glam::{Quat, Vec3};
 use keysplat::geometry::{Pinhole, se3};
 use keysplat::reference::{Image64, ImageGradient64};
-use keysplat::render::ViewCamera;
+use keysplat::splat::ViewCamera;
 use keysplat::splat::{Gaussian, GaussianCloud, ShDegree};
 use nalgebra::{Vector3, Vector6};
 

@@ -1,8 +1,8 @@
 //! Synthetic recordings: a furnished, textured room, ray-cast along a hand-held camera's path with exact depth and poses, written
 //! in TUM's layout.
 //!
-//! [`config`] says what a scene is; [`room`] and [`furniture`] build it, [`light`] and [`surface`] bake how it looks, [`path`] moves
-//! the camera, [`render`] casts the rays, [`degrade`] is the sensor. It leaves out: mirrors and glass, deforming things, rolling
+//! `config` says what a scene is; `room` and `furniture` build it, `light` and `surface` bake how it looks, `path` moves
+//! the camera, `render` casts the rays, `degrade` is the sensor. It leaves out: mirrors and glass, deforming things, rolling
 //! shutter, and shadows of the moving object.
 
 mod bvh;

@@ -1,0 +1,34 @@
+//! What rendering a Gaussian means: the constants of the splatting model and the camera of a view, shared by the rasterizer and its
+//! oracle.
+
+use crate::geometry::{Pinhole, Se3};
+
+/// Alpha below which a Gaussian does not touch a pixel: half a step of an 8-bit image, as in 3DGS.
+pub const ALPHA_MIN: f64 = 1.0 / 255.0;
+/// Alpha never exceeds this, so that 1 - α stays invertible.
+pub const ALPHA_MAX: f64 = 0.99;
+/// A pixel is finished before its transmittance would fall below this.
+pub const TRANSMITTANCE_MIN: f64 = 1e-4;
+/// Gaussians nearer than this (their projection blows up) or farther than that are not drawn, metres.
+pub const NEAR_METRES: f64 = 0.05;
+pub const FAR_METRES: f64 = 1e5;
+/// Added to the image covariance's diagonal, pixels²: the footprint of a pixel (3DGS).
+pub const DILATION: f64 = 0.3;
+pub const MIN_DETERMINANT: f64 = 1e-6;
+pub const MIN_QUATERNION_NORM_SQUARED: f64 = 1e-8;
+/// How far beyond the image's edge, as a share of its size, the Jacobian follows x/z and y/z.
+pub const TANGENT_MARGIN: f64 = 0.15;
+
+/// A camera to render from.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ViewCamera {
+    pub pinhole: Pinhole,
+    pub camera_from_world: Se3,
+}
+
+/// The bounds min x, max x, min y, max y on x/z and y/z inside the projection's Jacobian.
+pub fn tangent_bounds(p: &Pinhole) -> [f64; 4] {
+    let (w, h) = (f64::from(p.width), f64::from(p.height));
+    let (mx, my) = (TANGENT_MARGIN * w, TANGENT_MARGIN * h);
+    [(-mx - p.cx) / p.fx, (w + mx - p.cx) / p.fx, (-my - p.cy) / p.fy, (h + my - p.cy) / p.fy]
+}
