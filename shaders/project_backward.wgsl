@@ -73,24 +73,27 @@ fn backward(rank: u32) -> PoseGradient {
     let unit_rotation = rotation * inverse_norm;
     let projection = project_gaussian(view, mean_opacity.xyz, log_scale, unit_rotation);
 
-    let c = projection.covariance;
-    let conic = vec3(c.z, -c.y, c.x) / (c.x * c.z - c.y * c.y);
-    let by_mean_2d = vec2(conic.x * first.y + conic.y * first.z, conic.y * first.y + conic.z * first.z);
-    // power = -½(a dx² + c dy²) - b dx dy; Σ2D's gradient is -P·G·P of the conic's, symmetric (xx, xy, yy).
-    let by_conic = vec3(-0.5 * second.x, -0.5 * second.y, -0.5 * second.z);
-    let by_covariance = -congruence(conic, by_conic);
+    let by_mean_2d = inverse_covariance(projection, first.yz);
+    // log α = -½dᵀPd + …, P = Σ⁻¹: its gradient G by P is -½Σ q d·dᵀ, and by Σ it is -P·G·P. With T the image axes, Σ = T·Tᵀ + …, so
+    // that by column t it is -2P·(G·(P·t)), and by the logarithm of that axis' scale -2(P·t)·G·(P·t).
+    let by_inverse = -0.5 * second.xyz;
+    let p_0 = inverse_covariance(projection, projection.image_axis_0);
+    let p_1 = inverse_covariance(projection, projection.image_axis_1);
+    let p_2 = inverse_covariance(projection, projection.image_axis_2);
+    let g_0 = symmetric(by_inverse, p_0);
+    let g_1 = symmetric(by_inverse, p_1);
+    let g_2 = symmetric(by_inverse, p_2);
+    let by_image_0 = -2.0 * inverse_covariance(projection, g_0);
+    let by_image_1 = -2.0 * inverse_covariance(projection, g_1);
+    let by_image_2 = -2.0 * inverse_covariance(projection, g_2);
 
-    // T = J·M: gradients of its rows, then of J's rows and of M's columns.
+    // T = J·M: gradients by J's rows, and by M's columns.
     let axes = projection.axes_in_camera;
-    let row_x = projection.jacobian_x * axes;
-    let row_y = projection.jacobian_y * axes;
-    let by_row_x = 2.0 * (by_covariance.x * row_x + by_covariance.y * row_y);
-    let by_row_y = 2.0 * (by_covariance.y * row_x + by_covariance.z * row_y);
-    let by_jacobian_x = axes * by_row_x;
-    let by_jacobian_y = axes * by_row_y;
-    let by_axis_0 = projection.jacobian_x * by_row_x.x + projection.jacobian_y * by_row_y.x;
-    let by_axis_1 = projection.jacobian_x * by_row_x.y + projection.jacobian_y * by_row_y.y;
-    let by_axis_2 = projection.jacobian_x * by_row_x.z + projection.jacobian_y * by_row_y.z;
+    let by_jacobian_x = axes * vec3(by_image_0.x, by_image_1.x, by_image_2.x);
+    let by_jacobian_y = axes * vec3(by_image_0.y, by_image_1.y, by_image_2.y);
+    let by_axis_0 = projection.jacobian_x * by_image_0.x + projection.jacobian_y * by_image_0.y;
+    let by_axis_1 = projection.jacobian_x * by_image_1.x + projection.jacobian_y * by_image_1.y;
+    let by_axis_2 = projection.jacobian_x * by_image_2.x + projection.jacobian_y * by_image_2.y;
 
     begin_gradient(i);
     let by_point = point_gradient(projection, by_mean_2d, color_depth.w, by_jacobian_x, by_jacobian_y);
@@ -98,7 +101,7 @@ fn backward(rank: u32) -> PoseGradient {
     let opacity = sigmoid(mean_opacity.w);
     let by_mean = rotate_to_world(view, by_point) + by_mean_of_color;
     store_gradient(0u, i, vec4(by_mean, (1.0 - opacity) * first.x));
-    store_gradient(1u, i, vec4(dot(by_axis_0, axes[0]), dot(by_axis_1, axes[1]), dot(by_axis_2, axes[2]), 0.0));
+    store_gradient(1u, i, -2.0 * vec4(dot(p_0, g_0), dot(p_1, g_1), dot(p_2, g_2), 0.0));
     let scale = exp(log_scale);
     let by_rotation_matrix = mat3x3(
         rotate_to_world(view, by_axis_0) * scale.x,
@@ -114,13 +117,9 @@ fn backward(rank: u32) -> PoseGradient {
     return pose;
 }
 
-// P·G·P for symmetric matrices held as (xx, xy, yy).
-fn congruence(p: vec3<f32>, g: vec3<f32>) -> vec3<f32> {
-    let pg_xx = p.x * g.x + p.y * g.y;
-    let pg_xy = p.x * g.y + p.y * g.z;
-    let pg_yx = p.y * g.x + p.z * g.y;
-    let pg_yy = p.y * g.y + p.z * g.z;
-    return vec3(pg_xx * p.x + pg_xy * p.y, pg_xx * p.y + pg_xy * p.z, pg_yx * p.y + pg_yy * p.z);
+// Product of a symmetric matrix held as (xx, xy, yy).
+fn symmetric(m: vec3<f32>, v: vec2<f32>) -> vec2<f32> {
+    return vec2(m.x * v.x + m.y * v.y, m.y * v.x + m.z * v.y);
 }
 
 // Gradient with respect to the mean in the camera frame: through the image mean, the depth, and the Jacobian's own dependence.
@@ -154,7 +153,9 @@ fn color_gradient(i: u32, mean: vec3<f32>, by_color: vec3<f32>) -> vec3<f32> {
     var by_direction = vec3(0.0);
     for (var k = 0u; k < coefficients; k++) {
         by_direction += sh_basis_gradient(k, direction) * dot(parameters[(3u + k) * view.capacity + i].xyz, free);
-        store_gradient(3u + k, i, vec4(sh_basis(k, direction) * free, 0.0));
+        if k == 0u || wants_harmonics() {
+            store_gradient(3u + k, i, vec4(sh_basis(k, direction) * free, 0.0));
+        }
     }
     return (by_direction - direction * dot(direction, by_direction)) / distance;
 }

@@ -1,10 +1,11 @@
-// Projects every Gaussian of the map into a view: image mean, conic, opacity, colour, depth; and says which can be seen at all.
+// Projects every Gaussian of the map into a view: image mean, whitening, opacity, colour, depth; and says which can be seen at all.
 // One invocation a Gaussian. A culled one costs its tests only. Guards are written so that NaN fails them.
 
 @group(0) @binding(0) var<uniform> view: View;
 // [planes, capacity], see `render::layout::Plane`.
 @group(0) @binding(1) var<storage, read> parameters: array<vec4<f32>>;
-// [3, capacity]: (mean x, mean y, depth, cut), (conic xx, xy, yy, opacity), (r, g, b, -).
+// [3, capacity]: (mean x, mean y, depth, cut), (whitening xx, xy, yy, opacity),
+// (r, g, b, half extents of the ellipse in pixels as two f16).
 @group(0) @binding(2) var<storage, read_write> projected: array<vec4<f32>>;
 // [N] 1 where the Gaussian may touch the image.
 @group(0) @binding(3) var<storage, read_write> visible: array<u32>;
@@ -21,6 +22,13 @@ fn main(
     }
 }
 
+// Half extents travel as f16: rounded up by more than its precision, and capped beyond any image.
+const EXTENT_SLACK: f32 = 1.002;
+const MAX_EXTENT: f32 = 60000.0;
+const MAX_DETERMINANT: f32 = 1e30;
+// Far beyond any picture; a NaN fails the comparison.
+const MAX_COLOR: f32 = 1e6;
+
 fn project(i: u32) -> bool {
     let mean_opacity = parameters[i];
     let depth = dot(view.camera_row_2.xyz, mean_opacity.xyz) + view.camera_row_2.w;
@@ -36,8 +44,7 @@ fn project(i: u32) -> bool {
     let log_scale = parameters[view.capacity + i].xyz;
     let projection = project_gaussian(view, mean_opacity.xyz, log_scale, rotation * inverseSqrt(norm_squared));
     let c = projection.covariance;
-    let determinant = c.x * c.z - c.y * c.y;
-    if !(determinant >= MIN_DETERMINANT && determinant < 1e30) {
+    if !(projection.determinant >= MIN_DETERMINANT && projection.determinant < MAX_DETERMINANT) {
         return false;
     }
     let p = projection.p_in_camera;
@@ -49,10 +56,13 @@ fn project(i: u32) -> bool {
     if !all(inside) {
         return false;
     }
-    let conic = vec3(c.z, -c.y, c.x) / determinant;
+    let seen = color(i, mean_opacity.xyz);
+    if !all(seen < vec3(MAX_COLOR)) {
+        return false;
+    }
     projected[i] = vec4(mean, depth, cut);
-    projected[view.capacity + i] = vec4(conic, opacity);
-    projected[2u * view.capacity + i] = vec4(color(i, mean_opacity.xyz), 0.0);
+    projected[view.capacity + i] = vec4(whitening(projection), opacity);
+    projected[2u * view.capacity + i] = vec4(seen, bitcast<f32>(pack2x16float(min(half_extent * EXTENT_SLACK, vec2(MAX_EXTENT)))));
     return true;
 }
 
@@ -65,5 +75,6 @@ fn color(i: u32, mean: vec3<f32>) -> vec3<f32> {
             sum += sh_basis(k, direction) * parameters[(3u + k) * view.capacity + i].xyz;
         }
     }
-    return max(sum, vec3(0.0));
+    // Not max(), which may turn a NaN into 0.
+    return select(sum, vec3(0.0), sum < vec3(0.0));
 }

@@ -14,13 +14,13 @@
 @group(0) @binding(6) var<storage, read> state: array<vec2<f32>>;
 // [2, H, W] gradients of the loss: plane 0 (r, g, b, Σ w z), plane 1 (alpha, -, -, -).
 @group(0) @binding(7) var<storage, read> image_gradients: array<vec4<f32>>;
-// [pairs, 3] (Σ w g_rgb, Σ w g_depth), (Σ q, Σ q dx, Σ q dy, 0), (Σ q dx², Σ q dx dy, Σ q dy², 0), q = ∂L/∂power.
+// [pairs, 3] (Σ w g_rgb, Σ w g_depth), (Σ q, Σ q dx, Σ q dy, 0), (Σ q dx², Σ q dx dy, Σ q dy², 0), q = ∂L/∂log α.
 @group(0) @binding(8) var<storage, read_write> pair_gradients: array<vec4<f32>>;
 
 const CHUNK: u32 = 8u;
 const MASK_WORDS: u32 = (TILE_THREADS + 31u) / 32u;
 var<workgroup> batch_mean: array<vec4<f32>, BATCH>;
-var<workgroup> batch_conic: array<vec4<f32>, BATCH>;
+var<workgroup> batch_whitening: array<vec4<f32>, BATCH>;
 var<workgroup> batch_color: array<vec4<f32>, BATCH>;
 // [CHUNK, 3, TILE_THREADS] what each invocation adds to each pair of the chunk, and [CHUNK, MASK_WORDS] which of them add anything.
 var<workgroup> partial: array<vec4<f32>, CHUNK * 3u * TILE_THREADS>;
@@ -114,7 +114,7 @@ fn load_batch(start: u32, end: u32, local: u32) {
     for (var k = local; k < min(BATCH, end - start); k += TILE_THREADS) {
         let gaussian = slot_gaussians[sorted_slots[start + k]];
         batch_mean[k] = projected[gaussian];
-        batch_conic[k] = projected[view.capacity + gaussian];
+        batch_whitening[k] = projected[view.capacity + gaussian];
         batch_color[k] = projected[2u * view.capacity + gaussian];
     }
 }
@@ -135,13 +135,13 @@ fn sum_touched(item: u32) -> vec4<f32> {
 // One Gaussian, number `k` of the chunk, over this invocation's pixels; `position` counts from the start of the tile's list.
 fn blend_backward(k: u32, in_batch: u32, position: u32, quad: Quad, local: u32, pixels: ptr<function, PixelState>) {
     let mean = batch_mean[in_batch];
-    let conic = batch_conic[in_batch];
-    let power = exponent(mean.xy, conic.xyz, quad);
-    let hit = (power + mean.w >= vec4(0.0)) & (vec4(position) < (*pixels).last);
+    let shape = batch_whitening[in_batch];
+    let distance = half_distance(mean.xy, shape.xyz, quad);
+    let hit = (distance <= vec4(mean.w)) & (vec4(position) < (*pixels).last);
     if !any(hit) {
         return;
     }
-    let unbounded = conic.w * exp(min(power, vec4(0.0)));
+    let unbounded = shape.w * exp(-distance);
     let alpha = select(vec4(0.0), min(vec4(ALPHA_MAX), unbounded), hit);
     let color = batch_color[in_batch];
     let value = (*pixels).red * color.x + (*pixels).green * color.y + (*pixels).blue * color.z + (*pixels).depth * mean.z;

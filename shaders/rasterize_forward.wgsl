@@ -12,7 +12,7 @@
 @group(0) @binding(6) var<storage, read_write> state: array<vec2<f32>>;
 
 var<workgroup> batch_mean: array<vec4<f32>, BATCH>;
-var<workgroup> batch_conic: array<vec4<f32>, BATCH>;
+var<workgroup> batch_whitening: array<vec4<f32>, BATCH>;
 var<workgroup> batch_color: array<vec4<f32>, BATCH>;
 var<workgroup> finished: atomic<u32>;
 
@@ -51,13 +51,13 @@ fn main(
         let end = min(BATCH, range.y - start);
         for (var k = 0u; k < end; k++) {
             let mean = batch_mean[k];
-            let conic = batch_conic[k];
-            let power = exponent(mean.xy, conic.xyz, quad);
-            let hit = active_ & (power + mean.w >= vec4(0.0));
+            let shape = batch_whitening[k];
+            let distance = half_distance(mean.xy, shape.xyz, quad);
+            let hit = active_ & (distance <= vec4(mean.w));
             if !any(hit) {
                 continue;
             }
-            let alpha = min(vec4(ALPHA_MAX), conic.w * exp(min(power, vec4(0.0))));
+            let alpha = min(vec4(ALPHA_MAX), shape.w * exp(-distance));
             let next = transmittance * (1.0 - alpha);
             let stop = hit & (next < vec4(TRANSMITTANCE_MIN));
             let blend = hit & !stop;
@@ -85,7 +85,7 @@ fn load_batch(start: u32, end: u32, local: u32) {
     for (var k = local; k < min(BATCH, end - start); k += TILE_THREADS) {
         let gaussian = slot_gaussians[sorted_slots[start + k]];
         batch_mean[k] = projected[gaussian];
-        batch_conic[k] = projected[view.capacity + gaussian];
+        batch_whitening[k] = projected[view.capacity + gaussian];
         batch_color[k] = projected[2u * view.capacity + gaussian];
     }
 }

@@ -22,7 +22,7 @@ struct TileListsSetup {
 // [pairs] Gaussian of each slot.
 @group(0) @binding(9) var<storage, read_write> slot_gaussians: array<u32>;
 
-// Slack for rounding, in units of the quadratic form: a tile too many costs time, one too few a seam.
+// Slack for rounding, absolute and relative: a tile too many costs time, one too few a seam.
 const SLACK: f32 = 1e-3;
 
 @compute @workgroup_size(256)
@@ -37,12 +37,10 @@ fn main(
     }
     let gaussian = order[rank];
     let mean_cut = projected[gaussian];
-    let conic = projected[view.capacity + gaussian].xyz;
+    let whitening = projected[view.capacity + gaussian].xyz;
     let limit = mean_cut.w * (1.0 + SLACK) + SLACK;
     let mean = mean_cut.xy;
-    // The covariance is the conic's inverse; its diagonal gives the half extents of the ellipse.
-    let determinant = conic.x * conic.z - conic.y * conic.y;
-    let half_extent = sqrt(2.0 * limit * vec2(conic.z, conic.x) / determinant);
+    let half_extent = unpack2x16float(bitcast<u32>(projected[2u * view.capacity + gaussian].w));
     let last_tile = vec2<f32>(f32(view.tiles_x), f32(view.tiles_y)) - 1.0;
     let tile_size = vec2(f32(TILE_WIDTH), f32(TILE_HEIGHT));
     // Pixel centres are integers, so a tile's pixels span [first, first + size - 1].
@@ -56,7 +54,7 @@ fn main(
     }
     for (var y = low.y; y <= high.y; y++) {
         for (var x = low.x; x <= high.x; x++) {
-            if !touches(mean, conic, limit, vec2(f32(x), f32(y)) * tile_size, tile_size - 1.0) {
+            if !touches(mean, whitening, limit, vec2(f32(x), f32(y)) * tile_size, tile_size - 1.0) {
                 continue;
             }
             if emit {
@@ -72,27 +70,29 @@ fn main(
     }
 }
 
-// Whether ½dᵀPd ≤ limit somewhere on the rectangle [first, first + span], d measured from the mean. The form is convex: its minimum
+// Whether ½dᵀΣ⁻¹d ≤ limit somewhere on the rectangle [first, first + span], d measured from the mean. The form is convex: its minimum
 // is 0 inside, else on one of the two edges that face the mean.
-fn touches(mean: vec2<f32>, conic: vec3<f32>, limit: f32, first: vec2<f32>, span: vec2<f32>) -> bool {
+fn touches(mean: vec2<f32>, whitening: vec3<f32>, limit: f32, first: vec2<f32>, span: vec2<f32>) -> bool {
     let low = first - mean;
     let high = low + span;
     let nearest = clamp(vec2(0.0), low, high);
-    var smallest = 1e30;
     if all(nearest == vec2(0.0)) {
         return true;
     }
+    var smallest = 1e30;
     if nearest.x != 0.0 {
-        let y = clamp(-conic.y * nearest.x / conic.z, low.y, high.y);
-        smallest = min(smallest, form(conic, vec2(nearest.x, y)));
+        let y = -whitening.x * whitening.y * nearest.x / (whitening.y * whitening.y + whitening.z * whitening.z);
+        smallest = min(smallest, form(whitening, vec2(nearest.x, clamp(y, low.y, high.y))));
     }
     if nearest.y != 0.0 {
-        let x = clamp(-conic.y * nearest.y / conic.x, low.x, high.x);
-        smallest = min(smallest, form(conic, vec2(x, nearest.y)));
+        let x = -whitening.y * nearest.y / whitening.x;
+        smallest = min(smallest, form(whitening, vec2(clamp(x, low.x, high.x), nearest.y)));
     }
     return smallest <= limit;
 }
 
-fn form(conic: vec3<f32>, d: vec2<f32>) -> f32 {
-    return 0.5 * (conic.x * d.x * d.x + conic.z * d.y * d.y) + conic.y * d.x * d.y;
+fn form(whitening: vec3<f32>, d: vec2<f32>) -> f32 {
+    let u = whitening.x * d.x + whitening.y * d.y;
+    let v = whitening.z * d.y;
+    return u * u + v * v;
 }

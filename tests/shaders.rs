@@ -13,7 +13,7 @@ fn every_shader_validates() {
 fn validate(shader: &ShaderSource) -> Result<(), String> {
     let text = shader.text();
     let module = naga::front::wgsl::parse_str(&text).map_err(|e| format!("{}: {}", shader.name, e.emit_to_string(&text)))?;
-    Validator::new(ValidationFlags::all(), Capabilities::default())
+    Validator::new(ValidationFlags::all(), Capabilities::SHADER_FLOAT16_IN_FLOAT32)
         .validate(&module)
         .map_err(|e| format!("{}: {}", shader.name, e.emit_to_string(&text)))?;
     let found: Vec<&str> = module.entry_points.iter().map(|e| e.name.as_str()).collect();

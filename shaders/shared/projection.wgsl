@@ -11,6 +11,11 @@ struct Projection {
     jacobian_y: vec3<f32>,
     // Image covariance xx, xy, yy in pixels², dilated.
     covariance: vec3<f32>,
+    determinant: f32,
+    // The scaled axes in the image: columns of T, pixels.
+    image_axis_0: vec2<f32>,
+    image_axis_1: vec2<f32>,
+    image_axis_2: vec2<f32>,
     // 1 where x/z (y/z) was inside its bounds, 0 where clamped.
     inside: vec2<f32>,
 }
@@ -46,7 +51,33 @@ fn project_gaussian(view_: View, mean: vec3<f32>, log_scale: vec3<f32>, unit_rot
     let row_x = out.jacobian_x * out.axes_in_camera;
     let row_y = out.jacobian_y * out.axes_in_camera;
     out.covariance = vec3(dot(row_x, row_x) + DILATION, dot(row_x, row_y), dot(row_y, row_y) + DILATION);
+    // |x|²|y|² - (x·y)² = |x×y|²: without this a needle's determinant drowns in rounding.
+    let area = cross(row_x, row_y);
+    out.determinant = dot(area, area) + DILATION * (out.covariance.x + out.covariance.z - DILATION);
+    out.image_axis_0 = vec2(row_x.x, row_y.x);
+    out.image_axis_1 = vec2(row_x.y, row_y.y);
+    out.image_axis_2 = vec2(row_x.z, row_y.z);
     return out;
+}
+
+// (l_xx, l_xy, l_yy) of d ↦ (l_xx dx + l_xy dy, l_yy dy), whose squared length is ½dᵀΣ⁻¹d: a sum of squares, which cannot turn negative
+// and loses nothing to cancellation where a needle's conic would.
+fn whitening(p: Projection) -> vec3<f32> {
+    let c = p.covariance;
+    let inverse = inverseSqrt(2.0 * c.z);
+    return vec3(c.z * inverseSqrt(p.determinant), -c.y * inverseSqrt(p.determinant), 1.0) * inverse;
+}
+
+// Σ⁻¹v of the image covariance: the adjugate of a sum of outer products t·tᵀ is the sum of those of the perpendiculars.
+fn inverse_covariance(p: Projection, v: vec2<f32>) -> vec2<f32> {
+    let sum = across(p.image_axis_0, v) + across(p.image_axis_1, v) + across(p.image_axis_2, v);
+    return (DILATION * v + sum) / p.determinant;
+}
+
+// The part of v across the axis t, times |t|².
+fn across(t: vec2<f32>, v: vec2<f32>) -> vec2<f32> {
+    let perpendicular = vec2(t.y, -t.x);
+    return perpendicular * dot(perpendicular, v);
 }
 
 fn sigmoid(x: f32) -> f32 {

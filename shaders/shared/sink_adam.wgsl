@@ -10,6 +10,8 @@ struct AdamSetup {
     // log β, for the bias corrections.
     log_beta_1: f32,
     log_beta_2: f32,
+    // 1 on the steps that move the higher harmonics, else 0.
+    step_harmonics: u32,
 }
 
 @group(0) @binding(6) var<storage, read_write> parameters: array<vec4<f32>>;
@@ -17,14 +19,21 @@ struct AdamSetup {
 @group(0) @binding(8) var<storage, read_write> moments_2: array<vec4<f32>>;
 @group(0) @binding(9) var<uniform> adam: AdamSetup;
 
-// Lane w of plane 1 is free; in the first moments it counts the Gaussian's steps.
+// Lane w of planes 1 and 3 is free; in the first moments these count the Gaussian's steps, of all and of its higher harmonics.
 fn begin_gradient(i: u32) {
     moments_1[view.capacity + i].w += 1.0;
+    if adam.step_harmonics == 1u {
+        moments_1[3u * view.capacity + i].w += 1.0;
+    }
+}
+
+fn wants_harmonics() -> bool {
+    return adam.step_harmonics == 1u;
 }
 
 fn store_gradient(plane: u32, i: u32, raw: vec4<f32>) {
     let at = plane * view.capacity + i;
-    let steps = moments_1[view.capacity + i].w;
+    let steps = moments_1[select(1u, 3u, plane > 3u) * view.capacity + i].w;
     // A gradient that overflowed (or NaN) moves nothing.
     let gradient = select(vec4(0.0), raw, abs(raw) < vec4(1e15));
     let m = mix(gradient, moments_1[at], adam.beta_1);
@@ -33,6 +42,6 @@ fn store_gradient(plane: u32, i: u32, raw: vec4<f32>) {
     let unbiased_v = v / (1.0 - exp(steps * adam.log_beta_2));
     let rate = adam.rates[min(plane, 4u)];
     parameters[at] -= rate * unbiased_m / (sqrt(unbiased_v) + adam.epsilon);
-    moments_1[at] = select(m, vec4(m.xyz, steps), plane == 1u);
+    moments_1[at] = select(m, vec4(m.xyz, moments_1[at].w), plane == 1u || plane == 3u);
     moments_2[at] = v;
 }

@@ -4,6 +4,10 @@
 
 fn begin_gradient(i: u32) {}
 
+fn wants_harmonics() -> bool {
+    return true;
+}
+
 fn store_gradient(plane: u32, i: u32, gradient: vec4<f32>) {
     gradients[plane * view.capacity + i] = gradient;
 }

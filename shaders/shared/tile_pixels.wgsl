@@ -22,9 +22,10 @@ fn quad_of(view_: View, tile: u32, local: u32) -> Quad {
     return Quad(vec4<f32>(x), vec4<f32>(y), inside, y * view_.width + x);
 }
 
-// Exponent -½dᵀPd of a Gaussian at the quad's pixels.
-fn exponent(mean: vec2<f32>, conic: vec3<f32>, quad: Quad) -> vec4<f32> {
-    let dx = quad.x - mean.x;
+// ½dᵀΣ⁻¹d of a Gaussian at the quad's pixels: alpha is opacity·exp(-that).
+fn half_distance(mean: vec2<f32>, whitening: vec3<f32>, quad: Quad) -> vec4<f32> {
     let dy = quad.y - mean.y;
-    return -0.5 * (conic.x * dx * dx + conic.z * dy * dy) - conic.y * dx * dy;
+    let u = whitening.x * (quad.x - mean.x) + whitening.y * dy;
+    let v = whitening.z * dy;
+    return u * u + v * v;
 }

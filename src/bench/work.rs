@@ -46,10 +46,10 @@ pub fn count_work(rasterizer: &mut Rasterizer, cloud: &GpuCloud, camera: &ViewCa
     let slots: Vec<u32> = ws.slots[sorted].read(&gpu, 0, counts.pairs as usize)?;
     let slot_gaussians: Vec<u32> = ws.slot_gaussians.read(&gpu, 0, counts.pairs as usize)?;
     let means: Vec<[f32; 4]> = ws.projected.read(&gpu, 0, cloud.len())?;
-    let conics: Vec<[f32; 4]> = ws.projected.read(&gpu, cloud.capacity(), cloud.len())?;
+    let whitenings: Vec<[f32; 4]> = ws.projected.read(&gpu, cloud.capacity(), cloud.len())?;
     let splat = |pair: u32| {
         let gaussian = slot_gaussians[slots[pair as usize] as usize] as usize;
-        (means[gaussian], conics[gaussian])
+        (means[gaussian], whitenings[gaussian])
     };
     let per_tile: Vec<TileWork> = (0..tiles)
         .into_par_iter()
@@ -83,18 +83,19 @@ fn tile_work([first, end]: [u32; 2], pixels: &[(u32, u32)], splat: &dyn Fn(u32) 
         if (pair - first) % 64 == 0 && finished.iter().all(|f| *f) {
             break;
         }
-        let (mean, conic) = splat(pair);
+        let (mean, whitening) = splat(pair);
         work.evaluations += pixels.len() as u64;
         for (i, &(x, y)) in pixels.iter().enumerate() {
             if finished[i] {
                 continue;
             }
             let (dx, dy) = (x as f32 - mean[0], y as f32 - mean[1]);
-            let power = -0.5 * (conic[0] * dx * dx + conic[2] * dy * dy) - conic[1] * dx * dy;
-            if power + mean[3] < 0.0 {
+            let (u, v) = (whitening[0] * dx + whitening[1] * dy, whitening[2] * dy);
+            let distance = u * u + v * v;
+            if distance > mean[3] {
                 continue;
             }
-            let alpha = (conic[3] * power.min(0.0).exp()).min(ALPHA_MAX as f32);
+            let alpha = (whitening[3] * (-distance).exp()).min(ALPHA_MAX as f32);
             let next = transmittance[i] * (1.0 - alpha);
             if next < TRANSMITTANCE_MIN as f32 {
                 finished[i] = true;

@@ -20,6 +20,8 @@ pub struct AdamConfig {
     pub color_rate: f32,
     /// Other harmonics' coefficients a step.
     pub harmonics_rate: f32,
+    /// The other harmonics move every n-th step only: they converge slowly, and are most of the parameters (FastGS: 16).
+    pub harmonics_every: usize,
     /// Decay of the first and the second moments.
     pub beta_1: f32,
     pub beta_2: f32,
@@ -35,6 +37,7 @@ impl Default for AdamConfig {
             rotation_rate: 1e-3,
             color_rate: 5e-3,
             harmonics_rate: 2.5e-4,
+            harmonics_every: 16,
             beta_1: 0.9,
             beta_2: 0.999,
             epsilon: 1e-15,
@@ -50,6 +53,9 @@ impl AdamConfig {
         if rates.iter().any(|rate| !(rate.is_finite() && *rate >= 0.0)) {
             return Err("every Adam rate must be finite and not negative".into());
         }
+        if self.harmonics_every == 0 {
+            return Err("harmonics_every must be at least 1".into());
+        }
         if ![self.beta_1, self.beta_2].iter().all(|beta| (0.0..1.0).contains(beta)) || self.beta_1 == 0.0 || self.beta_2 == 0.0 {
             return Err("beta_1 and beta_2 must lie between 0 and 1, both excluded".into());
         }
@@ -57,17 +63,26 @@ impl AdamConfig {
     }
 }
 
-impl From<&AdamConfig> for AdamSetup {
-    fn from(c: &AdamConfig) -> Self {
-        let p = c.position_rate;
-        Self {
-            rates: [[p, p, p, c.opacity_rate], [c.scale_rate; 4], [c.rotation_rate; 4], [c.color_rate; 4], [c.harmonics_rate; 4]],
-            beta_1: c.beta_1,
-            beta_2: c.beta_2,
-            epsilon: c.epsilon,
-            log_beta_1: c.beta_1.ln(),
-            log_beta_2: c.beta_2.ln(),
-            pad: [0.0; 3],
+impl AdamConfig {
+    /// The GPU's copy for step number `step` of the map.
+    pub(super) fn setup(&self, step: usize) -> AdamSetup {
+        let p = self.position_rate;
+        let rates = [
+            [p, p, p, self.opacity_rate],
+            [self.scale_rate; 4],
+            [self.rotation_rate; 4],
+            [self.color_rate; 4],
+            [self.harmonics_rate; 4],
+        ];
+        AdamSetup {
+            rates,
+            beta_1: self.beta_1,
+            beta_2: self.beta_2,
+            epsilon: self.epsilon,
+            log_beta_1: self.beta_1.ln(),
+            log_beta_2: self.beta_2.ln(),
+            step_harmonics: u32::from(step % self.harmonics_every == 0),
+            pad: [0.0; 2],
         }
     }
 }

@@ -4,7 +4,7 @@ use bytemuck::{Pod, Zeroable};
 
 use super::{AdamConfig, LossConfig, LossTerms, TargetImage};
 use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, workgroups};
-use crate::render::layout::{AdamSetup, COUNTERS, Counter, LossSetup, VISIBLE_COUNTER, View};
+use crate::render::layout::{COUNTERS, Counter, LossSetup, VISIBLE_COUNTER, View};
 use crate::render::{GpuCloud, PreparedView, Rasterizer, ViewCounts, cloud_from_planes, shaders};
 use crate::splat::{GaussianCloud, ViewCamera};
 
@@ -70,6 +70,8 @@ struct Kernels {
 #[derive(Debug)]
 pub struct Optimiser {
     kernels: Kernels,
+    /// Steps submitted so far.
+    steps: usize,
     pixels: u32,
     gaussians: usize,
     partials: GpuBuffer,
@@ -96,6 +98,7 @@ impl Optimiser {
         let empty = |label: &str| GpuBuffer::storage(gpu, label, 16);
         Ok(Self {
             kernels,
+            steps: 0,
             pixels: 0,
             gaussians: 0,
             partials: empty("loss partials")?,
@@ -118,13 +121,14 @@ impl Optimiser {
         (loss, adam): (&LossConfig, &AdamConfig),
     ) -> Result<Vec<StepReport>, GpuError> {
         let gpu = rasterizer.gpu().clone();
-        let adam = GpuBuffer::uniform(&gpu, "Adam", &AdamSetup::from(adam))?;
         let log = GpuBuffer::storage(&gpu, "step log", (views.len() * std::mem::size_of::<StepLog>()) as u64)?;
         let mut reports = vec![StepReport::default(); views.len()];
         let mut pending: Vec<usize> = (0..views.len()).collect();
         while !pending.is_empty() {
             for (entry, &i) in pending.iter().enumerate() {
                 let TrainingView { camera, target } = &views[i];
+                let adam = GpuBuffer::uniform(&gpu, "Adam", &adam.setup(self.steps))?;
+                self.steps += 1;
                 let mut encoder = gpu.device.create_command_encoder(&Default::default());
                 self.encode(
                     &mut encoder,

@@ -48,6 +48,42 @@ pub(super) fn contributions(view: &View64, sorted: &[(usize, Projected64)], x: u
     (found, transmittance)
 }
 
+/// How far f32 can be trusted with a view.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Conditioning {
+    /// (Gaussian, pixel) pairs so close to a cut-off that rounding may decide them either way.
+    pub near_cutoffs: usize,
+    /// Largest rounding error of an exponent that counts.
+    pub exponent_error: f64,
+}
+
+/// Judges a view; `slack` is the relative width of the band around the cut-offs.
+pub fn conditioning(view: &View64, cloud: &[Gaussian64], slack: f64) -> Conditioning {
+    let sorted = sorted(view, cloud);
+    let p = &view.camera.pinhole;
+    let mut judged = Conditioning::default();
+    for (x, y) in (0..p.height).flat_map(|y| (0..p.width).map(move |x| (x, y))) {
+        for (_, g) in &sorted {
+            let d = Vector2::new(f64::from(x), f64::from(y)) - g.mean;
+            let power = -0.5 * (d.transpose() * g.conic * d)[0];
+            let terms = 0.5 * (d.abs().transpose() * g.conic.abs() * d.abs())[0];
+            // A few roundings of the largest term, and of the mean itself.
+            let by_mean = (g.conic * d).abs().dot(&g.mean.abs());
+            let error = 4.0 * f64::from(f32::EPSILON) * (terms + by_mean);
+            if power + g.cut > -error {
+                judged.exponent_error = judged.exponent_error.max(error);
+            }
+            let capped = g.opacity * power.exp() / model::ALPHA_MAX - 1.0;
+            let near = (power + g.cut).abs() < slack * (1.0 + power.abs()) + error || capped.abs() < slack + error;
+            judged.near_cutoffs += usize::from(near);
+        }
+        let (found, transmittance) = contributions(view, &sorted, x, y);
+        let finishing = transmittance < model::TRANSMITTANCE_MIN * 1.02 || found.iter().any(|c| c.transmittance < 1e-3);
+        judged.near_cutoffs += usize::from(finishing);
+    }
+    judged
+}
+
 /// Renders the map.
 pub fn render(view: &View64, cloud: &[Gaussian64]) -> Image64 {
     let sorted = sorted(view, cloud);

@@ -174,7 +174,8 @@ host_twins! {
         epsilon: f32,
         log_beta_1: f32,
         log_beta_2: f32,
-        pad: [f32; 3],
+        step_harmonics: u32,
+        pad: [f32; 2],
     }
 }
 
