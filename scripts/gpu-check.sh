@@ -1,0 +1,25 @@
+#!/bin/sh
+# Checks and measures keysplat on the machine it runs on, in one command: the GPU against the oracle, then the training step's stages
+# as JSON in the folder $1 (default benches/results), named after the adapter. Builds where there is a Rust toolchain, else uses the
+# build that was carried along in target/release (`cargo test --release --no-run && cargo build --release` makes it).
+set -eu
+
+cd "$(dirname "$0")/.."
+out=${1:-benches/results}
+mkdir -p "$out"
+if command -v cargo >/dev/null 2>&1; then
+    cargo build --release
+    cargo test --release --no-run
+fi
+
+target/release/keysplat adapters
+for test in gpu_against_reference gpu_properties; do
+    # The newest build of the test.
+    binary=$(find target/release/deps -maxdepth 1 -name "$test-*" -type f -perm -u+x -exec ls -t {} + | head -n 1)
+    [ -n "$binary" ] || { echo "gpu-check: $test is not built" >&2; exit 1; }
+    "$binary"
+done
+
+adapter=$(target/release/keysplat adapters 2>/dev/null | head -n 1 | sed 's/  \[.*//; s/[^A-Za-z0-9]\{1,\}/-/g; s/-$//' | tr '[:upper:]' '[:lower:]')
+shift 2>/dev/null || true
+target/release/keysplat bench step --out "$out/step-$adapter.json" "$@"
