@@ -4,11 +4,6 @@
 // Front to back, as the forward pass goes: with w = αT, v·g = colour·g_colour + depth·g_depth and R the share of the pixel's value
 // behind the Gaussian, ∂L/∂α = T(v·g) - R/(1-α). T is never recovered by division.
 
-@group(0) @binding(0) var<uniform> view: View;
-@group(0) @binding(1) var<storage, read> ranges: array<vec2<u32>>;
-@group(0) @binding(2) var<storage, read> sorted_slots: array<u32>;
-@group(0) @binding(3) var<storage, read> slot_gaussians: array<u32>;
-@group(0) @binding(4) var<storage, read> projected: array<vec4<f32>>;
 // [H, W] rendered (r, g, b, Σ w z) and (transmittance, last).
 @group(0) @binding(5) var<storage, read> color_depth: array<vec4<f32>>;
 @group(0) @binding(6) var<storage, read> state: array<vec2<f32>>;
@@ -19,9 +14,6 @@
 
 const CHUNK: u32 = 8u;
 const MASK_WORDS: u32 = (TILE_THREADS + 31u) / 32u;
-var<workgroup> batch_mean: array<vec4<f32>, BATCH>;
-var<workgroup> batch_whitening: array<vec4<f32>, BATCH>;
-var<workgroup> batch_color: array<vec4<f32>, BATCH>;
 // [CHUNK, 3, TILE_THREADS] what each invocation adds to each pair of the chunk, and [CHUNK, MASK_WORDS] which of them add anything.
 var<workgroup> partial: array<vec4<f32>, CHUNK * 3u * TILE_THREADS>;
 var<workgroup> touched: array<atomic<u32>, CHUNK * MASK_WORDS>;
@@ -108,15 +100,6 @@ fn load_pixels(quad: Quad) -> PixelState {
         pixels.behind[p] = dot(rendered, gradient) - final_state.x * gradient_alpha;
     }
     return pixels;
-}
-
-fn load_batch(start: u32, end: u32, local: u32) {
-    for (var k = local; k < min(BATCH, end - start); k += TILE_THREADS) {
-        let gaussian = slot_gaussians[sorted_slots[start + k]];
-        batch_mean[k] = projected[gaussian];
-        batch_whitening[k] = projected[view.capacity + gaussian];
-        batch_color[k] = projected[2u * view.capacity + gaussian];
-    }
 }
 
 // Sum over the invocations that touched a pair, in their order; `item` counts [CHUNK, 3].

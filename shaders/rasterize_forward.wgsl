@@ -1,19 +1,10 @@
 // Blends the tile's Gaussians front to back into colour, depth and transmittance (Kerbl et al. 2023, eq. 3). One workgroup a tile.
 
-@group(0) @binding(0) var<uniform> view: View;
-@group(0) @binding(1) var<storage, read> ranges: array<vec2<u32>>;
-// [pairs] slot of each sorted pair; [pairs] Gaussian of each slot.
-@group(0) @binding(2) var<storage, read> sorted_slots: array<u32>;
-@group(0) @binding(3) var<storage, read> slot_gaussians: array<u32>;
-@group(0) @binding(4) var<storage, read> projected: array<vec4<f32>>;
 // [H, W] (r, g, b, Σ w z): colour over the background, depth weighted by what was blended.
 @group(0) @binding(5) var<storage, read_write> color_depth: array<vec4<f32>>;
 // [H, W] (transmittance, pairs of the tile's list up to and with the last one blended).
 @group(0) @binding(6) var<storage, read_write> state: array<vec2<f32>>;
 
-var<workgroup> batch_mean: array<vec4<f32>, BATCH>;
-var<workgroup> batch_whitening: array<vec4<f32>, BATCH>;
-var<workgroup> batch_color: array<vec4<f32>, BATCH>;
 var<workgroup> finished: atomic<u32>;
 
 @compute @workgroup_size(TILE_THREADS)
@@ -78,14 +69,5 @@ fn main(
             color_depth[quad.index[p]] = vec4(color, depth[p]);
             state[quad.index[p]] = vec2(transmittance[p], bitcast<f32>(last[p]));
         }
-    }
-}
-
-fn load_batch(start: u32, end: u32, local: u32) {
-    for (var k = local; k < min(BATCH, end - start); k += TILE_THREADS) {
-        let gaussian = slot_gaussians[sorted_slots[start + k]];
-        batch_mean[k] = projected[gaussian];
-        batch_whitening[k] = projected[view.capacity + gaussian];
-        batch_color[k] = projected[2u * view.capacity + gaussian];
     }
 }
