@@ -21,5 +21,5 @@ for test in gpu_against_reference gpu_properties; do
 done
 
 adapter=$(target/release/keysplat adapters 2>/dev/null | head -n 1 | sed 's/  \[.*//; s/[^A-Za-z0-9]\{1,\}/-/g; s/-$//' | tr '[:upper:]' '[:lower:]')
-shift 2>/dev/null || true
+[ $# -eq 0 ] || shift
 target/release/keysplat bench step --out "$out/step-$adapter.json" "$@"
