@@ -5,13 +5,10 @@
 use std::error::Error;
 use std::path::Path;
 
-use keysplat::geometry::{StampedPose, Trajectory};
+use keysplat::evaluation::{Alignment, evaluate_trajectory};
+use keysplat::geometry::Trajectory;
 use keysplat::sequence::Sequence;
 use keysplat::tracking::{StageTimes, Tracker, TrackingConfig, TrackingState};
-use nalgebra::{Matrix3, Vector3};
-
-/// Poses further apart in time than this are not compared.
-const MAX_TIME_DIFFERENCE_S: f64 = 0.02;
 
 fn main() -> Result<(), Box<dyn Error>> {
     let (settings, paths): (Vec<String>, Vec<String>) = std::env::args().skip(1).partition(|a| a.contains('='));
@@ -44,7 +41,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     shared.sort_unstable();
     println!("landmarks shared by neighbouring keyframes: median {}", shared[shared.len() / 2]);
     if let Some(truth) = &sequence.groundtruth {
-        print_ate(&trajectory, truth);
+        print_errors(&trajectory, truth);
     }
     print_times(&times);
     if let Some(path) = paths.get(1) {
@@ -53,55 +50,17 @@ fn main() -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// A position estimated and its truth, metres.
-struct Pair {
-    timestamp_s: f64,
-    ours: Vector3<f64>,
-    truth: Vector3<f64>,
-}
-
-fn print_ate(trajectory: &Trajectory, truth: &Trajectory) {
-    let nearest = |t: f64| {
-        let by_time = |a: &&StampedPose, b: &&StampedPose| (a.timestamp_s - t).abs().total_cmp(&(b.timestamp_s - t).abs());
-        trajectory.poses.iter().min_by(by_time).filter(|p| (p.timestamp_s - t).abs() <= MAX_TIME_DIFFERENCE_S)
-    };
-    let pair = |t: &StampedPose| {
-        nearest(t.timestamp_s).map(|p| Pair { timestamp_s: t.timestamp_s, ours: position(p), truth: position(t) })
-    };
-    let mut pairs: Vec<Pair> = truth.poses.iter().filter_map(pair).collect();
-    if pairs.len() < 3 {
-        println!("too few poses with truth");
-        return;
+fn print_errors(trajectory: &Trajectory, truth: &Trajectory) {
+    match evaluate_trajectory(truth, trajectory, Alignment::Rigid) {
+        Ok(e) => println!(
+            "ATE RMSE {:.3} cm over {} poses, median {:.2} cm, worst {:.2} cm",
+            100.0 * e.ate_rmse_m,
+            e.pairs,
+            100.0 * e.ate_median_m,
+            100.0 * e.ate_max_m
+        ),
+        Err(error) => println!("no ATE: {error}"),
     }
-    let count = pairs.len() as f64;
-    let ours_mean = pairs.iter().map(|p| p.ours).sum::<Vector3<f64>>() / count;
-    let truth_mean = pairs.iter().map(|p| p.truth).sum::<Vector3<f64>>() / count;
-    for p in &mut pairs {
-        p.ours -= ours_mean;
-        p.truth -= truth_mean;
-    }
-    let covariance: Matrix3<f64> = pairs.iter().map(|p| p.truth * p.ours.transpose()).sum();
-    let svd = covariance.svd(true, true);
-    let (u, v_t) = (svd.u.unwrap_or_default(), svd.v_t.unwrap_or_default());
-    let flip = Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, (u * v_t).determinant().signum()));
-    let rotation = u * flip * v_t;
-    let errors: Vec<(f64, f64)> = pairs.iter().map(|p| (p.timestamp_s, (rotation * p.ours - p.truth).norm())).collect();
-    let rmse = (errors.iter().map(|e| e.1 * e.1).sum::<f64>() / errors.len() as f64).sqrt();
-    let worst = errors.iter().max_by(|a, b| a.1.total_cmp(&b.1)).copied().unwrap_or_default();
-    // What scale would fit best says whether depth or drift is at fault.
-    let spread: f64 = pairs.iter().map(|p| p.ours.norm_squared()).sum();
-    let scale = pairs.iter().map(|p| (rotation * p.ours).dot(&p.truth)).sum::<f64>() / spread;
-    println!(
-        "ATE RMSE {:.3} cm over {} poses, worst {:.2} cm at {:.2} s, best scale {scale:.4}",
-        rmse * 100.0,
-        errors.len(),
-        worst.1 * 100.0,
-        worst.0
-    );
-}
-
-fn position(pose: &StampedPose) -> Vector3<f64> {
-    pose.world_from_camera.translation.vector
 }
 
 fn print_times(times: &[StageTimes]) {

@@ -2,7 +2,7 @@
 // One invocation a Gaussian. A culled one costs its tests only. Guards are written so that NaN fails them.
 
 @group(0) @binding(0) var<uniform> view: View;
-// [planes, capacity], see `render::layout::Plane`.
+// [planes, capacity], see `render::GpuCloud`.
 @group(0) @binding(1) var<storage, read> parameters: array<vec4<f32>>;
 // [3, capacity]: (mean x, mean y, depth, cut), (whitening xx, xy, yy, opacity),
 // (r, g, b, half extents of the ellipse in pixels as two f16).
