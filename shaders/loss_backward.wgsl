@@ -6,19 +6,17 @@
 @group(0) @binding(2) var<storage, read> state: array<vec2<f32>>;
 @group(0) @binding(3) var<storage, read> target_color: array<u32>;
 @group(0) @binding(4) var<storage, read> target_depth: array<f32>;
+// [3 channels, bordered H, bordered W], zero on the border.
 @group(0) @binding(5) var<storage, read> partials: array<vec4<f32>>;
 // [2, H, W] plane 0 (r, g, b, Σ w z), plane 1 (alpha, -, -, -).
 @group(0) @binding(6) var<storage, read_write> image_gradients: array<vec4<f32>>;
 
-// (by mean, by square, by product) of one channel, and the same filtered along rows: [26 rows, 16 columns].
-var<workgroup> source: array<vec3<f32>, 676>;
+// (by mean, by square, by product) of one channel filtered along rows: [26 rows, 16 columns].
 var<workgroup> rows: array<vec3<f32>, 416>;
 
 // Filtered partials of four outputs.
 struct Partials {
-    by_mean: vec4<f32>,
-    by_square: vec4<f32>,
-    by_product: vec4<f32>,
+    at: array<vec3<f32>, 4>,
 }
 
 @compute @workgroup_size(64)
@@ -33,11 +31,11 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
     let end = select(0u, min(4u, setup.height - min(y, setup.height)), x < setup.width);
     var gradient: array<vec4<f32>, 4>;
     for (var channel = 0u; channel < 3u; channel++) {
-        workgroupBarrier();
-        load_tile(workgroup.xy, channel, local, pixels);
+        let stride = bordered(setup.width);
+        let corner = (channel * bordered(setup.height) + workgroup.y * 16u) * stride + workgroup.x * 16u;
         workgroupBarrier();
         for (var item = local; item < SPAN * 4u; item += 64u) {
-            filter_row(item / 4u, item % 4u * 4u);
+            filter_row(corner + item / 4u * stride + item % 4u * 4u, item * 4u);
         }
         workgroupBarrier();
         let filtered = filter_column(column, row);
@@ -45,7 +43,7 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
             let index = (y + k) * setup.width + x;
             let rendered = color_depth[index][channel];
             let wanted = unpack4x8unorm(target_color[index])[channel];
-            let ssim = filtered.by_mean[k] + 2.0 * rendered * filtered.by_square[k] + wanted * filtered.by_product[k];
+            let ssim = dot(filtered.at[k], vec3(1.0, 2.0 * rendered, wanted));
             let l1 = sign(rendered - wanted);
             gradient[k][channel] = ((1.0 - setup.ssim_weight) * l1 - setup.ssim_weight * ssim) * per_pixel / 3.0;
         }
@@ -64,49 +62,47 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
     }
 }
 
-fn load_tile(workgroup: vec2<u32>, channel: u32, local: u32, pixels: u32) {
-    for (var k = local; k < SPAN * SPAN; k += 64u) {
-        let pixel = vec2<i32>(workgroup * 16u + vec2(k % SPAN, k / SPAN)) - i32(RADIUS);
-        var value = vec3(0.0);
-        if all(pixel >= vec2(0)) && pixel.x < i32(setup.width) && pixel.y < i32(setup.height) {
-            value = partials[channel * pixels + u32(pixel.y) * setup.width + u32(pixel.x)].xyz;
-        }
-        source[k] = value;
+fn add(sum: ptr<function, Partials>, value: vec3<f32>, taps: vec4<f32>) {
+    if taps.x != 0.0 {
+        (*sum).at[0] += taps.x * value;
+    }
+    if taps.y != 0.0 {
+        (*sum).at[1] += taps.y * value;
+    }
+    if taps.z != 0.0 {
+        (*sum).at[2] += taps.z * value;
+    }
+    if taps.w != 0.0 {
+        (*sum).at[3] += taps.w * value;
     }
 }
 
-fn add(sum: ptr<function, Partials>, value: vec3<f32>, taps: vec4<f32>) {
-    (*sum).by_mean += taps * value.x;
-    (*sum).by_square += taps * value.y;
-    (*sum).by_product += taps * value.z;
-}
-
-fn filter_row(row: u32, first: u32) {
-    let at = row * SPAN + first;
+// Four outputs along a row, from the partials at `at` on, to `rows[to]` on.
+fn filter_row(at: u32, to: u32) {
     var sum: Partials;
-    add(&sum, source[at], T0);
-    add(&sum, source[at + 1u], T1);
-    add(&sum, source[at + 2u], T2);
-    add(&sum, source[at + 3u], T3);
-    add(&sum, source[at + 4u], T4);
-    add(&sum, source[at + 5u], T5);
-    add(&sum, source[at + 6u], T6);
-    add(&sum, source[at + 7u], T7);
-    add(&sum, source[at + 8u], T8);
-    add(&sum, source[at + 9u], T9);
-    add(&sum, source[at + 10u], T10);
-    add(&sum, source[at + 11u], T11);
-    add(&sum, source[at + 12u], T12);
-    add(&sum, source[at + 13u], T13);
+    add(&sum, partials[at + 0u].xyz, T0);
+    add(&sum, partials[at + 1u].xyz, T1);
+    add(&sum, partials[at + 2u].xyz, T2);
+    add(&sum, partials[at + 3u].xyz, T3);
+    add(&sum, partials[at + 4u].xyz, T4);
+    add(&sum, partials[at + 5u].xyz, T5);
+    add(&sum, partials[at + 6u].xyz, T6);
+    add(&sum, partials[at + 7u].xyz, T7);
+    add(&sum, partials[at + 8u].xyz, T8);
+    add(&sum, partials[at + 9u].xyz, T9);
+    add(&sum, partials[at + 10u].xyz, T10);
+    add(&sum, partials[at + 11u].xyz, T11);
+    add(&sum, partials[at + 12u].xyz, T12);
+    add(&sum, partials[at + 13u].xyz, T13);
     for (var k = 0u; k < 4u; k++) {
-        rows[row * 16u + first + k] = vec3(sum.by_mean[k], sum.by_square[k], sum.by_product[k]);
+        rows[to + k] = sum.at[k];
     }
 }
 
 fn filter_column(column: u32, first: u32) -> Partials {
     let at = first * 16u + column;
     var sum: Partials;
-    add(&sum, rows[at], T0);
+    add(&sum, rows[at + 0u], T0);
     add(&sum, rows[at + 16u], T1);
     add(&sum, rows[at + 32u], T2);
     add(&sum, rows[at + 48u], T3);

@@ -8,7 +8,7 @@
 // [H, W] the keyframe: 8-bit RGBA, and sensor depth in metres (0: not measured).
 @group(0) @binding(3) var<storage, read> target_color: array<u32>;
 @group(0) @binding(4) var<storage, read> target_depth: array<f32>;
-// [3 channels, H, W] ∂SSIM/∂(mean, mean square, mean product).
+// [3 channels, bordered H, bordered W] ∂SSIM/∂(mean, mean square, mean product), zero on the border.
 @group(0) @binding(5) var<storage, read_write> partials: array<vec4<f32>>;
 // [workgroups] sums of |colour error|, SSIM, |depth error|, squared colour error.
 @group(0) @binding(6) var<storage, read_write> loss_sums: array<vec4<f32>>;
@@ -17,19 +17,13 @@ const C1: f32 = 0.0001;
 const C2: f32 = 0.0009;
 
 var<workgroup> source: array<vec2<f32>, 676>;
-// Row-filtered means (x, y), squares (x², y²) and products xy: [26 rows, 16 columns].
-var<workgroup> rows_means: array<vec2<f32>, 416>;
-var<workgroup> rows_squares: array<vec2<f32>, 416>;
-var<workgroup> rows_product: array<f32, 416>;
+// [26 rows, 16 columns] filtered along rows.
+var<workgroup> rows: array<vec4<f32>, 416>;
 var<workgroup> sums: array<vec4<f32>, 64>;
 
-// Filtered values of four outputs.
+// Filtered (x, y, x² + y², xy) of four outputs: SSIM needs the variances' sum only.
 struct Moments {
-    mean_x: vec4<f32>,
-    mean_y: vec4<f32>,
-    square_x: vec4<f32>,
-    square_y: vec4<f32>,
-    product: vec4<f32>,
+    at: array<vec4<f32>, 4>,
 }
 
 struct Ssim {
@@ -50,7 +44,6 @@ fn main(
     let row = local / 16u * 4u;
     let x = workgroup.x * 16u + column;
     let y = workgroup.y * 16u + row;
-    let pixels = setup.width * setup.height;
     var sum = vec4(0.0);
     let inside = select(vec4(0.0), vec4(1.0), (vec4(y) + vec4(0u, 1u, 2u, 3u) < vec4(setup.height)) & vec4(x < setup.width));
     for (var channel = 0u; channel < 3u; channel++) {
@@ -65,7 +58,7 @@ fn main(
         let own = (row + RADIUS) * SPAN + column + RADIUS;
         for (var k = 0u; k < 4u; k++) {
             if inside[k] > 0.0 {
-                let to = channel * pixels + (y + k) * setup.width + x;
+                let to = (channel * bordered(setup.height) + y + k + RADIUS) * bordered(setup.width) + x + RADIUS;
                 partials[to] = vec4(ssim.by_mean[k], ssim.by_square[k], ssim.by_product[k], 0.0);
             }
             let pair = source[own + k * SPAN];
@@ -106,85 +99,87 @@ fn load_tile(workgroup: vec2<u32>, channel: u32, local: u32) {
     }
 }
 
-fn add_source(m: ptr<function, Moments>, value: vec2<f32>, taps: vec4<f32>) {
-    let x = taps * value.x;
-    let y = taps * value.y;
-    (*m).mean_x += x;
-    (*m).mean_y += y;
-    (*m).square_x += x * value.x;
-    (*m).square_y += y * value.y;
-    (*m).product += x * value.y;
+fn add(sum: ptr<function, Moments>, value: vec4<f32>, taps: vec4<f32>) {
+    // The taps are constants: a zero one costs nothing.
+    if taps.x != 0.0 {
+        (*sum).at[0] += taps.x * value;
+    }
+    if taps.y != 0.0 {
+        (*sum).at[1] += taps.y * value;
+    }
+    if taps.z != 0.0 {
+        (*sum).at[2] += taps.z * value;
+    }
+    if taps.w != 0.0 {
+        (*sum).at[3] += taps.w * value;
+    }
+}
+
+fn quantities(at: u32) -> vec4<f32> {
+    let value = source[at];
+    return vec4(value, dot(value, value), value.x * value.y);
 }
 
 // Four outputs of one row, from column `first` of the tile on.
 fn filter_row(row: u32, first: u32) {
     let at = row * SPAN + first;
-    var m: Moments;
-    add_source(&m, source[at], T0);
-    add_source(&m, source[at + 1u], T1);
-    add_source(&m, source[at + 2u], T2);
-    add_source(&m, source[at + 3u], T3);
-    add_source(&m, source[at + 4u], T4);
-    add_source(&m, source[at + 5u], T5);
-    add_source(&m, source[at + 6u], T6);
-    add_source(&m, source[at + 7u], T7);
-    add_source(&m, source[at + 8u], T8);
-    add_source(&m, source[at + 9u], T9);
-    add_source(&m, source[at + 10u], T10);
-    add_source(&m, source[at + 11u], T11);
-    add_source(&m, source[at + 12u], T12);
-    add_source(&m, source[at + 13u], T13);
+    var sum: Moments;
+    add(&sum, quantities(at + 0u), T0);
+    add(&sum, quantities(at + 1u), T1);
+    add(&sum, quantities(at + 2u), T2);
+    add(&sum, quantities(at + 3u), T3);
+    add(&sum, quantities(at + 4u), T4);
+    add(&sum, quantities(at + 5u), T5);
+    add(&sum, quantities(at + 6u), T6);
+    add(&sum, quantities(at + 7u), T7);
+    add(&sum, quantities(at + 8u), T8);
+    add(&sum, quantities(at + 9u), T9);
+    add(&sum, quantities(at + 10u), T10);
+    add(&sum, quantities(at + 11u), T11);
+    add(&sum, quantities(at + 12u), T12);
+    add(&sum, quantities(at + 13u), T13);
     for (var k = 0u; k < 4u; k++) {
-        let to = row * 16u + first + k;
-        rows_means[to] = vec2(m.mean_x[k], m.mean_y[k]);
-        rows_squares[to] = vec2(m.square_x[k], m.square_y[k]);
-        rows_product[to] = m.product[k];
+        rows[row * 16u + first + k] = sum.at[k];
     }
-}
-
-fn add_row(m: ptr<function, Moments>, at: u32, taps: vec4<f32>) {
-    let means = rows_means[at];
-    let squares = rows_squares[at];
-    (*m).mean_x += taps * means.x;
-    (*m).mean_y += taps * means.y;
-    (*m).square_x += taps * squares.x;
-    (*m).square_y += taps * squares.y;
-    (*m).product += taps * rows_product[at];
 }
 
 // Four outputs of one column, from row `first` of the tile on.
 fn filter_column(column: u32, first: u32) -> Moments {
     let at = first * 16u + column;
-    var m: Moments;
-    add_row(&m, at, T0);
-    add_row(&m, at + 16u, T1);
-    add_row(&m, at + 32u, T2);
-    add_row(&m, at + 48u, T3);
-    add_row(&m, at + 64u, T4);
-    add_row(&m, at + 80u, T5);
-    add_row(&m, at + 96u, T6);
-    add_row(&m, at + 112u, T7);
-    add_row(&m, at + 128u, T8);
-    add_row(&m, at + 144u, T9);
-    add_row(&m, at + 160u, T10);
-    add_row(&m, at + 176u, T11);
-    add_row(&m, at + 192u, T12);
-    add_row(&m, at + 208u, T13);
-    return m;
+    var sum: Moments;
+    add(&sum, rows[at + 0u], T0);
+    add(&sum, rows[at + 16u], T1);
+    add(&sum, rows[at + 32u], T2);
+    add(&sum, rows[at + 48u], T3);
+    add(&sum, rows[at + 64u], T4);
+    add(&sum, rows[at + 80u], T5);
+    add(&sum, rows[at + 96u], T6);
+    add(&sum, rows[at + 112u], T7);
+    add(&sum, rows[at + 128u], T8);
+    add(&sum, rows[at + 144u], T9);
+    add(&sum, rows[at + 160u], T10);
+    add(&sum, rows[at + 176u], T11);
+    add(&sum, rows[at + 192u], T12);
+    add(&sum, rows[at + 208u], T13);
+    return sum;
 }
 
 fn ssim_of(m: Moments) -> Ssim {
-    // Rounding can make a variance negative; it is then a constant 0.
-    let raw = m.square_x - m.mean_x * m.mean_x;
-    let variances = max(raw, vec4(0.0)) + max(m.square_y - m.mean_y * m.mean_y, vec4(0.0));
-    let free = select(vec4(0.0), vec4(1.0), raw > vec4(0.0));
-    let a1 = 2.0 * m.mean_x * m.mean_y + C1;
-    let a2 = 2.0 * (m.product - m.mean_x * m.mean_y) + C2;
-    let b1 = 1.0 / (m.mean_x * m.mean_x + m.mean_y * m.mean_y + C1);
+    let mean_x = vec4(m.at[0].x, m.at[1].x, m.at[2].x, m.at[3].x);
+    let mean_y = vec4(m.at[0].y, m.at[1].y, m.at[2].y, m.at[3].y);
+    let squares = vec4(m.at[0].z, m.at[1].z, m.at[2].z, m.at[3].z);
+    let product = vec4(m.at[0].w, m.at[1].w, m.at[2].w, m.at[3].w);
+    // Rounding can make the sum of the variances negative; it is then a constant 0.
+    let means = mean_x * mean_x + mean_y * mean_y;
+    let variances = max(squares - means, vec4(0.0));
+    let free = select(vec4(0.0), vec4(1.0), squares > means);
+    let a1 = 2.0 * mean_x * mean_y + C1;
+    let a2 = 2.0 * (product - mean_x * mean_y) + C2;
+    let b1 = 1.0 / (means + C1);
     let b2 = 1.0 / (variances + C2);
     let value = a1 * a2 * b1 * b2;
     let by_variance = -value * b2 * free;
     let by_covariance = 2.0 * a1 * b1 * b2;
-    let by_mean = 2.0 * m.mean_y * a2 * b1 * b2 - 2.0 * m.mean_x * (value * b1 + by_variance) - m.mean_y * by_covariance;
+    let by_mean = 2.0 * mean_y * a2 * b1 * b2 - 2.0 * mean_x * (value * b1 + by_variance) - mean_y * by_covariance;
     return Ssim(value, by_mean, by_variance, by_covariance);
 }

@@ -7,6 +7,18 @@
 
 var<workgroup> finished: atomic<u32>;
 
+// What a quad of pixels has blended so far.
+struct Blended {
+    red: vec4<f32>,
+    green: vec4<f32>,
+    blue: vec4<f32>,
+    depth: vec4<f32>,
+    transmittance: vec4<f32>,
+    last: vec4<u32>,
+    // Whether the pixel takes more.
+    open: vec4<bool>,
+}
+
 @compute @workgroup_size(TILE_THREADS)
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
@@ -18,18 +30,21 @@ fn main(
         return;
     }
     let range = ranges[tile];
-    let quad = quad_of(view, tile, local);
-    var red = vec4(0.0);
-    var green = vec4(0.0);
-    var blue = vec4(0.0);
-    var depth = vec4(0.0);
-    var transmittance = vec4(1.0);
-    var active_ = quad.inside;
-    var last = vec4(0u);
+    var quads: array<Quad, QUADS>;
+    var blended: array<Blended, QUADS>;
+    for (var q = 0u; q < QUADS; q++) {
+        quads[q] = quad_of(view, tile, local * QUADS + q);
+        blended[q].transmittance = vec4(1.0);
+        blended[q].open = quads[q].inside;
+    }
     var counted = false;
 
     for (var start = range.x; start < range.y; start += BATCH) {
-        if !counted && !any(active_) {
+        var open = vec4(false);
+        for (var q = 0u; q < QUADS; q++) {
+            open = open | blended[q].open;
+        }
+        if !counted && !any(open) {
             counted = true;
             atomicAdd(&finished, 1u);
         }
@@ -43,31 +58,43 @@ fn main(
         for (var k = 0u; k < end; k++) {
             let mean = batch_mean[k];
             let shape = batch_whitening[k];
-            let distance = half_distance(mean.xy, shape.xyz, quad);
-            let hit = active_ & (distance <= vec4(mean.w));
-            if !any(hit) {
-                continue;
-            }
-            let alpha = min(vec4(ALPHA_MAX), shape.w * exp(-distance));
-            let next = transmittance * (1.0 - alpha);
-            let stop = hit & (next < vec4(TRANSMITTANCE_MIN));
-            let blend = hit & !stop;
-            active_ = active_ & !stop;
-            let weight = select(vec4(0.0), alpha * transmittance, blend);
             let color = batch_color[k];
-            red += weight * color.x;
-            green += weight * color.y;
-            blue += weight * color.z;
-            depth += weight * mean.z;
-            transmittance = select(transmittance, next, blend);
-            last = select(last, vec4(start + k + 1u - range.x), blend);
+            for (var q = 0u; q < QUADS; q++) {
+                var quad = blended[q];
+                blend(mean, shape, color, start + k + 1u - range.x, quads[q], &quad);
+                blended[q] = quad;
+            }
         }
     }
-    for (var p = 0; p < 4; p++) {
-        if quad.inside[p] {
-            let color = vec3(red[p], green[p], blue[p]) + transmittance[p] * view.background.xyz;
-            color_depth[quad.index[p]] = vec4(color, depth[p]);
-            state[quad.index[p]] = vec2(transmittance[p], bitcast<f32>(last[p]));
+    for (var q = 0u; q < QUADS; q++) {
+        let done = blended[q];
+        for (var p = 0; p < 4; p++) {
+            if quads[q].inside[p] {
+                let color = vec3(done.red[p], done.green[p], done.blue[p]) + done.transmittance[p] * view.background.xyz;
+                color_depth[quads[q].index[p]] = vec4(color, done.depth[p]);
+                state[quads[q].index[p]] = vec2(done.transmittance[p], bitcast<f32>(done.last[p]));
+            }
         }
     }
+}
+
+// Blends one Gaussian, the `number`-th of the tile, into a quad.
+fn blend(mean: vec4<f32>, shape: vec4<f32>, color: vec4<f32>, number: u32, quad: Quad, to: ptr<function, Blended>) {
+    let distance = half_distance(mean.xy, shape.xyz, quad);
+    let hit = (*to).open & (distance <= vec4(mean.w));
+    if !any(hit) {
+        return;
+    }
+    let alpha = min(vec4(ALPHA_MAX), shape.w * exp(-distance));
+    let next = (*to).transmittance * (1.0 - alpha);
+    let stop = hit & (next < vec4(TRANSMITTANCE_MIN));
+    let taken = hit & !stop;
+    (*to).open = (*to).open & !stop;
+    let weight = select(vec4(0.0), alpha * (*to).transmittance, taken);
+    (*to).red += weight * color.x;
+    (*to).green += weight * color.y;
+    (*to).blue += weight * color.z;
+    (*to).depth += weight * mean.z;
+    (*to).transmittance = select((*to).transmittance, next, taken);
+    (*to).last = select((*to).last, vec4(number), taken);
 }

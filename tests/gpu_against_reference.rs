@@ -12,7 +12,7 @@ use keysplat::reference::adam::Adam64;
 use keysplat::reference::loss::{LossWeights, Target64, loss};
 use keysplat::reference::project_backward::backward;
 use keysplat::reference::{Cutoffs, Gaussian64, Image64, View64, cloud64, rasterize_forward};
-use keysplat::render::{GpuCloud, Rasterizer};
+use keysplat::render::{BlendForm, GpuCloud, Rasterizer};
 use keysplat::splat::ViewCamera;
 use keysplat::splat::{GaussianCloud, ShDegree};
 use nalgebra::Vector3;
@@ -48,16 +48,26 @@ fn flat(cloud: &[Gaussian64]) -> Vec<f64> {
     cloud.iter().flat_map(Gaussian64::flat).collect()
 }
 
+/// A rasterizer of each form of the blending passes, with its optimiser.
+fn both_forms(gpu: &Arc<Gpu>) -> impl Iterator<Item = (Rasterizer, Optimiser)> {
+    BlendForm::ALL.into_iter().map(|form| {
+        let rasterizer = Rasterizer::with_form(gpu.clone(), form).unwrap();
+        let optimiser = Optimiser::new(&rasterizer).unwrap();
+        (rasterizer, optimiser)
+    })
+}
+
 /// Renders on both and compares the images; returns the oracle's.
 fn compare_images(gpu: &Arc<Gpu>, cloud: &GaussianCloud, camera: &ViewCamera) -> Image64 {
-    let mut rasterizer = Rasterizer::new(gpu.clone()).unwrap();
-    let rendered = rasterizer.render(&upload(gpu, cloud), camera, BACKGROUND).unwrap();
     let expected = rasterize_forward::render(&view64(camera), &cloud64(cloud));
-    let got: Vec<f64> = rendered.color_depth.iter().flatten().chain(&rendered.transmittance).map(|v| f64::from(*v)).collect();
     let colors = expected.color.iter().zip(&expected.depth).flat_map(|(c, d)| [c.x, c.y, c.z, *d]);
     let wanted: Vec<f64> = colors.chain(expected.transmittance.iter().copied()).collect();
-    let error = common::relative_error(&got, &wanted);
-    assert!(error < IMAGE_TOLERANCE, "image: {error:e}");
+    for (mut rasterizer, _) in both_forms(gpu) {
+        let rendered = rasterizer.render(&upload(gpu, cloud), camera, BACKGROUND).unwrap();
+        let got: Vec<f64> = rendered.color_depth.iter().flatten().chain(&rendered.transmittance).map(|v| f64::from(*v)).collect();
+        let error = common::relative_error(&got, &wanted);
+        assert!(error < IMAGE_TOLERANCE, "image, {:?}: {error:e}", rasterizer.form());
+    }
     expected
 }
 
@@ -68,20 +78,22 @@ fn compare_gradients(gpu: &Arc<Gpu>, cloud: &GaussianCloud, camera: &ViewCamera,
     let narrow: Vec<[f32; 4]> =
         by_image.color.iter().zip(&by_image.depth).map(|(c, d)| [c.x as f32, c.y as f32, c.z as f32, *d as f32]).collect();
     let alpha: Vec<f32> = by_image.alpha.iter().map(|a| *a as f32).collect();
-    let mut rasterizer = Rasterizer::new(gpu.clone()).unwrap();
-    let mut optimiser = Optimiser::new(gpu).unwrap();
-    let got =
-        optimiser.gradients_from_image(&mut rasterizer, &upload(gpu, cloud), camera, BACKGROUND, (&narrow, &alpha)).unwrap();
     let expected = backward(&view64(camera), &cloud64(cloud), &by_image);
-    let (got_flat, wanted) = (flat(&cloud64(&got.cloud)), flat(&expected.cloud));
-    assert!(got_flat.iter().all(|v| v.is_finite()), "a gradient is not finite");
-    let error = common::relative_error(&got_flat, &wanted);
-    assert!(error < GRADIENT_TOLERANCE, "gradient: {error:e}");
-    let pose: Vec<f64> = got.pose.iter().map(|v| f64::from(*v)).collect();
-    let error = common::relative_error(&pose, expected.pose.as_slice());
-    assert!(error < GRADIENT_TOLERANCE, "pose gradient: {error:e}");
-    let (dot, a, b) = got_flat.iter().zip(&wanted).fold((0.0, 0.0, 0.0), |s, (x, y)| (s.0 + x * y, s.1 + x * x, s.2 + y * y));
-    assert!(dot / (a * b).sqrt() > 1.0 - 1e-6, "gradient's direction");
+    let wanted = flat(&expected.cloud);
+    for (mut rasterizer, mut optimiser) in both_forms(gpu) {
+        let form = rasterizer.form();
+        let got =
+            optimiser.gradients_from_image(&mut rasterizer, &upload(gpu, cloud), camera, BACKGROUND, (&narrow, &alpha)).unwrap();
+        let got_flat = flat(&cloud64(&got.cloud));
+        assert!(got_flat.iter().all(|v| v.is_finite()), "a gradient is not finite");
+        let error = common::relative_error(&got_flat, &wanted);
+        assert!(error < GRADIENT_TOLERANCE, "gradient, {form:?}: {error:e}");
+        let pose: Vec<f64> = got.pose.iter().map(|v| f64::from(*v)).collect();
+        let error = common::relative_error(&pose, expected.pose.as_slice());
+        assert!(error < GRADIENT_TOLERANCE, "pose gradient, {form:?}: {error:e}");
+        let dots = got_flat.iter().zip(&wanted).fold((0.0, 0.0, 0.0), |s, (x, y)| (s.0 + x * y, s.1 + x * x, s.2 + y * y));
+        assert!(dots.0 / (dots.1 * dots.2).sqrt() > 1.0 - 1e-6, "gradient's direction, {form:?}");
+    }
 }
 
 #[test]
@@ -126,7 +138,7 @@ fn the_loss_and_its_whole_gradient_agree() {
         let cloud = common::scene(&mut rng, 200, ShDegree::ALL[(seed % 4) as usize]);
         let (image, wide) = target(&mut rng, camera.pinhole);
         let mut rasterizer = Rasterizer::new(gpu.clone()).unwrap();
-        let mut optimiser = Optimiser::new(&gpu).unwrap();
+        let mut optimiser = Optimiser::new(&rasterizer).unwrap();
         let on_gpu = upload(&gpu, &cloud);
         let image = upload_target(&gpu, &image, &wide);
         let got = optimiser.gradients(&mut rasterizer, &on_gpu, &camera, &image, &config).unwrap();
@@ -158,7 +170,7 @@ fn adam_steps_agree() {
     let (image, wide) = target(&mut rng, camera.pinhole);
     let image = upload_target(&gpu, &image, &wide);
     let mut rasterizer = Rasterizer::new(gpu.clone()).unwrap();
-    let mut optimiser = Optimiser::new(&gpu).unwrap();
+    let mut optimiser = Optimiser::new(&rasterizer).unwrap();
     let on_gpu = upload(&gpu, &cloud);
     let mut expected: Vec<Vec<f64>> = cloud64(&cloud).iter().map(Gaussian64::flat).collect();
     let mut states = vec![Adam64::default(); cloud.len()];
@@ -268,7 +280,7 @@ fn pairs_that_outgrow_their_buffers_are_never_dropped() {
     let mut rasterizer = Rasterizer::new(gpu.clone()).unwrap();
     let views = [TrainingView { camera, target: &image }; 3];
     let configs = (&LossConfig::default(), &AdamConfig::default());
-    let reports = Optimiser::new(&gpu).unwrap().steps(&mut rasterizer, &on_gpu, &views, configs).unwrap();
+    let reports = Optimiser::new(&rasterizer).unwrap().steps(&mut rasterizer, &on_gpu, &views, configs).unwrap();
     assert!(reports.iter().all(|r| r.counts.pairs > 131_072 && r.loss.l1 > 0.0), "{reports:?}");
     assert!(reports[2].loss.total(configs.0) < reports[0].loss.total(configs.0), "the steps did not descend");
 }

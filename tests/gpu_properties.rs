@@ -38,7 +38,7 @@ fn machine() -> Option<&'static Mutex<Machine>> {
         .get_or_init(|| match Gpu::open(None) {
             Ok(gpu) => {
                 let rasterizer = Rasterizer::new(gpu.clone()).unwrap();
-                let optimiser = Optimiser::new(&gpu).unwrap();
+                let optimiser = Optimiser::new(&rasterizer).unwrap();
                 Some(Mutex::new(Machine { gpu, rasterizer, optimiser }))
             }
             Err(error) => {

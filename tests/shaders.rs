@@ -1,17 +1,18 @@
 //! Every shader is valid WGSL with the entry points that the host asks for; no adapter is needed.
 
 use keysplat::render::layout::struct_layouts;
-use keysplat::render::{SHADERS, ShaderSource};
+use keysplat::render::{BlendForm, SHADERS, ShaderSource};
 use naga::valid::{Capabilities, ValidationFlags, Validator};
 
 #[test]
 fn every_shader_validates() {
-    let faults: Vec<String> = SHADERS.iter().filter_map(|shader| validate(shader).err()).collect();
+    let faults: Vec<String> =
+        BlendForm::ALL.iter().flat_map(|&form| SHADERS.iter().filter_map(move |shader| validate(shader, form).err())).collect();
     assert!(faults.is_empty(), "{}", faults.join("\n"));
 }
 
-fn validate(shader: &ShaderSource) -> Result<(), String> {
-    let text = shader.text();
+fn validate(shader: &ShaderSource, form: BlendForm) -> Result<(), String> {
+    let text = shader.text(form);
     let module = naga::front::wgsl::parse_str(&text).map_err(|e| format!("{}: {}", shader.name, e.emit_to_string(&text)))?;
     Validator::new(ValidationFlags::all(), Capabilities::SHADER_FLOAT16_IN_FLOAT32)
         .validate(&module)
@@ -26,7 +27,7 @@ fn host_structs_match_the_shaders() {
     let host = struct_layouts();
     let mut seen = std::collections::BTreeSet::new();
     for shader in SHADERS {
-        let module = naga::front::wgsl::parse_str(&shader.text()).unwrap();
+        let module = naga::front::wgsl::parse_str(&shader.text(BlendForm::default())).unwrap();
         for (_, ty) in module.types.iter() {
             let (Some(name), naga::TypeInner::Struct { members, span }) = (&ty.name, &ty.inner) else { continue };
             let Some((_, size, fields)) = host.iter().find(|(host_name, ..)| host_name == name) else { continue };

@@ -1,6 +1,6 @@
 // The 11-tap Gaussian window (σ = 1.5 pixels) of SSIM (Wang et al. 2004), zero beyond the image, and the tiling that both loss
 // passes share: a workgroup of 64 covers 16×16 pixels with a border of 5. Each invocation filters four outputs side by side, so that an
-// input is loaded once for all four.
+// input is loaded once for all four, and the quantities that are filtered together are the lanes of a vector.
 const RADIUS: u32 = 5u;
 const SPAN: u32 = 26u;
 const W0: f32 = 0.00102838;
@@ -25,6 +25,11 @@ const T10 = vec4(W0, W1, W2, W3);
 const T11 = vec4(0.0, W0, W1, W2);
 const T12 = vec4(0.0, 0.0, W0, W1);
 const T13 = vec4(0.0, 0.0, 0.0, W0);
+
+// Pixels per row and per column of a plane that carries a border of RADIUS zeros and ends at whole tiles.
+fn bordered(size: u32) -> u32 {
+    return (size + 15u) / 16u * 16u + 2u * RADIUS;
+}
 
 // What every part of the loss is told; host twin: `optimise::loss::LossSetup`.
 struct LossSetup {

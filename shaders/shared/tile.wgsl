@@ -1,5 +1,5 @@
-// A tile's Gaussians and pixels, as the blending passes see them. A workgroup covers a tile: each invocation takes a 2×2 quad of pixels,
-// held as the lanes of a vec4, and the Gaussians pass in batches through workgroup memory.
+// A tile's Gaussians and pixels, as the blending passes see them. A workgroup covers a tile: each invocation takes QUADS quads of 2×2
+// pixels, a quad held as the lanes of a vec4, and the Gaussians pass in batches through workgroup memory.
 
 @group(0) @binding(0) var<uniform> view: View;
 // [tiles] (first pair, past the last) in the sorted list; [pairs] slot of each sorted pair; [pairs] Gaussian of each slot.
@@ -9,7 +9,8 @@
 // [3, capacity], see `project_forward`.
 @group(0) @binding(4) var<storage, read> projected: array<vec4<f32>>;
 
-const TILE_THREADS: u32 = TILE_WIDTH * TILE_HEIGHT / 4u;
+const TILE_QUADS: u32 = TILE_WIDTH * TILE_HEIGHT / 4u;
+const TILE_THREADS: u32 = TILE_QUADS / QUADS;
 // Gaussians held in workgroup memory at a time.
 const BATCH: u32 = 64u;
 var<workgroup> batch_mean: array<vec4<f32>, BATCH>;
@@ -25,10 +26,11 @@ struct Quad {
     index: vec4<u32>,
 }
 
-fn quad_of(view_: View, tile: u32, local: u32) -> Quad {
+// Quad number `quad` of the tile's TILE_QUADS: four make a block of 4×4 pixels, and the blocks follow in rows.
+fn quad_of(view_: View, tile: u32, quad: u32) -> Quad {
     let first = vec2((tile % view_.tiles_x) * TILE_WIDTH, (tile / view_.tiles_x) * TILE_HEIGHT);
-    let quads = TILE_WIDTH / 2u;
-    let corner = first + 2u * vec2(local % quads, local / quads);
+    let block = vec2(quad / 4u % (TILE_WIDTH / 4u), quad / TILE_WIDTH);
+    let corner = first + 4u * block + 2u * vec2(quad % 2u, quad / 2u % 2u);
     let x = vec4(corner.x, corner.x + 1u, corner.x, corner.x + 1u);
     let y = vec4(corner.y, corner.y, corner.y + 1u, corner.y + 1u);
     let inside = (x < vec4(view_.width)) & (y < vec4(view_.height));

@@ -5,7 +5,7 @@ use std::time::Instant;
 use serde::Serialize;
 
 use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, workgroups};
-use crate::render::shaders;
+use crate::render::{BlendForm, shaders};
 
 /// What the adapter reaches on the simplest kernels.
 #[derive(Clone, Copy, Debug, Serialize)]
@@ -25,7 +25,7 @@ const BUSY_S: f64 = 0.05;
 
 /// Measures both rates; the best of a few runs each.
 pub fn measure_rates(gpu: &Gpu) -> Result<Rates, GpuError> {
-    let text = shaders::RATES.text();
+    let text = shaders::RATES.text(BlendForm::default());
     let copy = Kernel::new(gpu, "copy_memory", "copy_memory", &text);
     let multiply_add = Kernel::new(gpu, "multiply_add", "multiply_add", &text);
     let source = GpuBuffer::storage(gpu, "rates source", COPY_BYTES)?;

@@ -11,7 +11,7 @@ use super::scene::BenchScene;
 use super::work::{Work, count_work};
 use crate::gpu::{Gpu, GpuError};
 use crate::optimise::{AdamConfig, LossConfig, Optimiser, TrainingView};
-use crate::render::Rasterizer;
+use crate::render::{BlendForm, Rasterizer};
 use crate::splat::ShDegree;
 
 /// What to measure.
@@ -21,6 +21,8 @@ pub struct StepBench {
     pub width: u32,
     pub height: u32,
     pub sh_degree: ShDegree,
+    /// Form of the blending passes.
+    pub form: BlendForm,
     /// Timed steps; a few untimed ones precede them.
     pub steps: usize,
 }
@@ -54,8 +56,8 @@ const BATCH: usize = 4;
 /// Measures a training step on a made-up scene.
 pub fn bench_step(gpu: &Arc<Gpu>, bench: &StepBench, rates: &Rates) -> Result<StepReport, GpuError> {
     let scene = BenchScene::new(gpu, bench.gaussians, (bench.width, bench.height), bench.sh_degree)?;
-    let mut rasterizer = Rasterizer::new(gpu.clone())?;
-    let mut optimiser = Optimiser::new(gpu)?;
+    let mut rasterizer = Rasterizer::with_form(gpu.clone(), bench.form)?;
+    let mut optimiser = Optimiser::new(&rasterizer)?;
     let work = count_work(&mut rasterizer, &scene.cloud, &scene.camera)?;
     // Rates of zero keep the scene as it is, step after step, at the same cost.
     let still = AdamConfig {

@@ -2,9 +2,10 @@
 
 use std::path::PathBuf;
 
-use clap::{Args, Subcommand};
+use clap::{Args, Subcommand, ValueEnum};
 use keysplat::bench::{Rates, StepBench, StepReport, bench_step, measure_rates};
 use keysplat::gpu::{AdapterSummary, Gpu};
+use keysplat::render::BlendForm;
 use keysplat::splat::ShDegree;
 use miette::{IntoDiagnostic, miette};
 use serde::Serialize;
@@ -32,6 +33,9 @@ struct StepArgs {
     /// Degrees of the spherical harmonics.
     #[arg(long, value_delimiter = ',', default_values_t = [0u8, 1, 3])]
     sh: Vec<u8>,
+    /// Form of the blending passes: the adapter's own by default.
+    #[arg(long, value_enum)]
+    form: Option<Form>,
     /// Timed steps per scene.
     #[arg(long, default_value_t = 12)]
     steps: usize,
@@ -44,6 +48,13 @@ struct StepArgs {
     /// Part of the name of the adapter to use.
     #[arg(long)]
     adapter: Option<String>,
+}
+
+/// See [`BlendForm`].
+#[derive(Clone, Copy, ValueEnum)]
+enum Form {
+    Wide,
+    Narrow,
 }
 
 fn parse_size(text: &str) -> Result<(u32, u32), String> {
@@ -71,6 +82,11 @@ pub fn bench(args: &BenchArgs) -> miette::Result<()> {
 fn step(args: &StepArgs) -> miette::Result<()> {
     let gpu = Gpu::open_profiled(args.adapter.as_deref()).into_diagnostic()?;
     let rates = measure_rates(&gpu).into_diagnostic()?;
+    let form = match args.form {
+        None => BlendForm::of(&gpu),
+        Some(Form::Wide) => BlendForm::Wide,
+        Some(Form::Narrow) => BlendForm::Narrow,
+    };
     let mut report = Report {
         adapter: gpu.adapter.clone(),
         cpu: keysplat::evaluation::machine::cpu_name(),
@@ -86,7 +102,7 @@ fn step(args: &StepArgs) -> miette::Result<()> {
         for &(width, height) in &args.size {
             for &degree in &args.sh {
                 let sh_degree = ShDegree::new(degree).ok_or_else(|| miette!("--sh takes degrees 0 to 3, not {degree}"))?;
-                let bench = StepBench { gaussians, width, height, sh_degree, steps: args.steps };
+                let bench = StepBench { gaussians, width, height, sh_degree, form, steps: args.steps };
                 let measured = bench_step(&gpu, &bench, &rates).into_diagnostic()?;
                 if !args.json {
                     print(&measured);

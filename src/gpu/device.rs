@@ -158,6 +158,11 @@ impl Gpu {
         Ok(Arc::new(Self { device, queue, adapter: adapter.get_info().into(), failure, memory: Arc::default(), profiler }))
     }
 
+    /// Whether the adapter is a program on the CPU.
+    pub fn is_software(&self) -> bool {
+        self.adapter.kind == "cpu"
+    }
+
     /// The first failure that the device reported since it was opened, if any.
     pub fn check(&self) -> Result<(), GpuError> {
         match &*self.failure.lock().unwrap_or_else(PoisonError::into_inner) {

@@ -56,10 +56,11 @@ pub struct Mapper {
 
 impl Mapper {
     pub fn new(gpu: Arc<Gpu>, config: &MappingConfig) -> Result<Self, MappingError> {
+        let rasterizer = Rasterizer::new(gpu.clone())?;
         Ok(Self {
             config: config.clone(),
-            rasterizer: Rasterizer::new(gpu.clone())?,
-            optimiser: Optimiser::new(&gpu)?,
+            optimiser: Optimiser::new(&rasterizer)?,
+            rasterizer,
             cloud: GpuCloud::new(&gpu, config.sh_degree, FIRST_CAPACITY)?,
             keyframes: Vec::new(),
             rng: Rng::with_seed(config.seed),

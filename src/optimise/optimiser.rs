@@ -5,10 +5,16 @@ use bytemuck::{Pod, Zeroable};
 use super::{AdamConfig, LossConfig, LossTerms, TargetImage};
 use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, workgroups};
 use crate::render::layout::{COUNTERS, Counter, LossSetup, VISIBLE_COUNTER, View};
-use crate::render::{GpuCloud, PreparedView, Rasterizer, ViewCounts, cloud_from_planes, shaders};
+use crate::render::{BlendForm, GpuCloud, PreparedView, Rasterizer, ViewCounts, cloud_from_planes, shaders};
 use crate::splat::{GaussianCloud, ViewCamera};
 
 const LOSS_TILE: u32 = 16;
+const LOSS_RADIUS: u32 = 5;
+
+/// Twin of the shaders' function: pixels along a side of a plane with a border of zeros.
+fn bordered(size: u32) -> u32 {
+    size.next_multiple_of(LOSS_TILE) + 2 * LOSS_RADIUS
+}
 
 /// What a step did.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -72,7 +78,8 @@ pub struct Optimiser {
     kernels: Kernels,
     /// Steps submitted so far.
     steps: usize,
-    pixels: u32,
+    /// Width and height that the buffers per pixel are for.
+    size: (u32, u32),
     gaussians: usize,
     partials: GpuBuffer,
     image_gradients: GpuBuffer,
@@ -83,13 +90,18 @@ pub struct Optimiser {
 }
 
 impl Optimiser {
-    pub fn new(gpu: &Gpu) -> Result<Self, GpuError> {
-        let kernel = |source: &shaders::ShaderSource| Kernel::new(gpu, source.name, "main", &source.text());
+    /// For the views that `rasterizer` renders: both passes of the blending take the same form.
+    pub fn new(rasterizer: &Rasterizer) -> Result<Self, GpuError> {
+        let (gpu, form) = (rasterizer.gpu(), rasterizer.form());
+        let kernel = |source: &shaders::ShaderSource| Kernel::new(gpu, source.name, "main", &source.text(form));
         let kernels = Kernels {
             loss_forward: kernel(&shaders::LOSS_FORWARD),
             loss_reduce: kernel(&shaders::LOSS_REDUCE),
             loss_backward: kernel(&shaders::LOSS_BACKWARD),
-            rasterize_backward: kernel(&shaders::RASTERIZE_BACKWARD),
+            rasterize_backward: kernel(match form {
+                BlendForm::Wide => &shaders::RASTERIZE_BACKWARD_SPLATS,
+                BlendForm::Narrow => &shaders::RASTERIZE_BACKWARD_PIXELS,
+            }),
             project_backward: kernel(&shaders::PROJECT_BACKWARD),
             project_backward_adam: kernel(&shaders::PROJECT_BACKWARD_ADAM),
             pose_reduce: kernel(&shaders::POSE_REDUCE),
@@ -99,7 +111,7 @@ impl Optimiser {
         Ok(Self {
             kernels,
             steps: 0,
-            pixels: 0,
+            size: (0, 0),
             gaussians: 0,
             partials: empty("loss partials")?,
             image_gradients: empty("image gradients")?,
@@ -339,14 +351,15 @@ impl Optimiser {
     }
 
     fn reserve(&mut self, gpu: &Gpu, view: &View, cloud: &GpuCloud) -> Result<(), GpuError> {
-        if view.pixels() != self.pixels {
+        if (view.width, view.height) != self.size {
             let pixels = u64::from(view.pixels());
             let blocks = u64::from(view.width.div_ceil(LOSS_TILE) * view.height.div_ceil(LOSS_TILE));
-            self.partials = GpuBuffer::storage(gpu, "loss partials", pixels * 48)?;
+            let bordered = u64::from(bordered(view.width)) * u64::from(bordered(view.height));
+            self.partials = GpuBuffer::storage(gpu, "loss partials", bordered * 48)?;
             self.image_gradients = GpuBuffer::storage(gpu, "image gradients", pixels * 32)?;
             // Its length is the number of terms that are summed.
             self.loss_sums = GpuBuffer::storage(gpu, "loss sums", blocks * 16)?;
-            self.pixels = view.pixels();
+            self.size = (view.width, view.height);
         }
         if cloud.capacity() > self.gaussians {
             self.pose_sums = GpuBuffer::storage(gpu, "pose sums", (cloud.capacity() as u64).div_ceil(256) * 32)?;

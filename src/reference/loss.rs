@@ -92,8 +92,8 @@ fn ssim(width: usize, height: usize, x: &[f64], y: &[f64]) -> (Vec<f64>, Vec<f64
         let a1 = 2.0 * mx[i] * my[i] + C1;
         let a2 = 2.0 * (xy[i] - mx[i] * my[i]) + C2;
         let b1 = mx[i] * mx[i] + my[i] * my[i] + C1;
-        let raw = xx[i] - mx[i] * mx[i];
-        let b2 = raw.max(0.0) + (yy[i] - my[i] * my[i]).max(0.0) + C2;
+        let raw = xx[i] + yy[i] - mx[i] * mx[i] - my[i] * my[i];
+        let b2 = raw.max(0.0) + C2;
         value[i] = a1 * a2 / (b1 * b2);
         // log-derivatives of the four factors, by the mean, the mean square and the mean product.
         let free = if raw > 0.0 { 1.0 } else { 0.0 };

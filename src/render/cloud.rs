@@ -2,7 +2,7 @@
 
 use glam::{Quat, Vec3};
 
-use super::layout::{GEOMETRY_PLANES, GatherSetup};
+use super::layout::{BlendForm, GEOMETRY_PLANES, GatherSetup};
 use super::shaders;
 use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, workgroups};
 use crate::splat::{GaussianCloud, ShDegree};
@@ -25,7 +25,7 @@ impl GpuCloud {
     pub fn new(gpu: &Gpu, sh_degree: ShDegree, capacity: usize) -> Result<Self, GpuError> {
         let capacity = capacity.max(256);
         let [parameters, moments_1, moments_2] = allocate(gpu, sh_degree, capacity)?;
-        let gather = Kernel::new(gpu, "gather", "main", &shaders::GATHER.text());
+        let gather = Kernel::new(gpu, "gather", "main", &shaders::GATHER.text(BlendForm::default()));
         Ok(Self { sh_degree, count: 0, capacity, parameters, moments_1, moments_2, gather })
     }
 

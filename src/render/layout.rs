@@ -2,16 +2,19 @@
 
 use bytemuck::{Pod, Zeroable};
 use nalgebra::Vector3;
+use serde::Serialize;
 
+use crate::gpu::Gpu;
 use crate::splat::model::*;
 
-/// A tile is 16×8 pixels: 32 invocations with a 2×2 quad each. On the software adapter 16×16 takes twice as long to blend (small
-/// Gaussians leave most of it untouched); 8×8 is a little faster there, but fills no real GPU's subgroup.
+/// A tile is 16×8 pixels. On the software adapter 16×16 takes twice as long to blend: small Gaussians leave most of it untouched.
 pub const TILE_WIDTH: u32 = 16;
 pub const TILE_HEIGHT: u32 = 8;
 /// Elements that one workgroup scans, and keys that one workgroup sorts.
 pub const SCAN_BLOCK: u32 = 2048;
-pub const SORT_BLOCK: u32 = 2048;
+pub const SORT_BLOCK: u32 = 1024;
+/// Blocks whose digit counts one workgroup scans.
+pub const SORT_CHUNK: u32 = 64;
 /// Counters in the counter buffer.
 pub const VISIBLE_COUNTER: u32 = 0;
 pub const PAIR_COUNTER: u32 = 1;
@@ -20,8 +23,37 @@ pub const COUNTERS: u32 = 2;
 /// Planes of vec4 that precede the higher harmonics: (position, raw opacity), (log scale, -), rotation (w, x, y, z), (constant colour, -).
 pub const GEOMETRY_PLANES: usize = 3;
 
+/// How a tile's pixels are spread over invocations. Both forms give the same result up to rounding; each is the faster one on its kind
+/// of adapter.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum BlendForm {
+    /// A 2×2 quad each, 32 invocations a tile; the backward pass keeps a Gaussian per invocation. For GPUs.
+    #[default]
+    Wide,
+    /// A 4×4 block each, 8 invocations a tile: every load from memory serves 16 pixels. For software adapters, where loads are what costs.
+    Narrow,
+}
+
+impl BlendForm {
+    pub const ALL: [Self; 2] = [Self::Wide, Self::Narrow];
+
+    /// The faster form on this adapter.
+    pub fn of(gpu: &Gpu) -> Self {
+        if gpu.is_software() { Self::Narrow } else { Self::Wide }
+    }
+
+    /// Quads of 2×2 pixels per invocation.
+    fn quads(self) -> u32 {
+        match self {
+            Self::Wide => 1,
+            Self::Narrow => 4,
+        }
+    }
+}
+
 /// The constants above as WGSL, put before every shader.
-pub fn wgsl_constants() -> String {
+pub fn wgsl_constants(form: BlendForm) -> String {
     let floats = [
         ("ALPHA_MIN", ALPHA_MIN),
         ("ALPHA_MAX", ALPHA_MAX),
@@ -35,8 +67,10 @@ pub fn wgsl_constants() -> String {
     let integers = [
         ("TILE_WIDTH", TILE_WIDTH),
         ("TILE_HEIGHT", TILE_HEIGHT),
+        ("QUADS", form.quads()),
         ("SCAN_BLOCK", SCAN_BLOCK),
         ("SORT_BLOCK", SORT_BLOCK),
+        ("SORT_CHUNK", SORT_CHUNK),
         ("VISIBLE_COUNTER", VISIBLE_COUNTER),
         ("PAIR_COUNTER", PAIR_COUNTER),
     ];

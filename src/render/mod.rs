@@ -8,6 +8,7 @@ mod sort;
 mod workspace;
 
 pub use cloud::{GpuCloud, cloud_from_planes};
+pub use layout::BlendForm;
 pub use rasterizer::{PreparedView, Rasterizer, Rendered, ViewCounts};
 pub use shaders::{SHADERS, ShaderSource};
 pub use workspace::Workspace;

@@ -6,7 +6,7 @@
 use std::sync::Arc;
 
 use super::cloud::GpuCloud;
-use super::layout::{COUNTERS, Counter, PAIR_COUNTER, TileListsSetup, VISIBLE_COUNTER, View};
+use super::layout::{BlendForm, COUNTERS, Counter, PAIR_COUNTER, TileListsSetup, VISIBLE_COUNTER, View};
 use super::shaders;
 use super::sort::{Scan, ScanJob, ScanLength, Sort};
 use super::workspace::Workspace;
@@ -61,6 +61,7 @@ struct Kernels {
 #[derive(Debug)]
 pub struct Rasterizer {
     gpu: Arc<Gpu>,
+    form: BlendForm,
     kernels: Kernels,
     count_mode: GpuBuffer,
     emit_mode: GpuBuffer,
@@ -77,8 +78,15 @@ pub struct PreparedView {
 }
 
 impl Rasterizer {
+    /// With the form of the blending passes that suits the adapter.
     pub fn new(gpu: Arc<Gpu>) -> Result<Self, GpuError> {
-        let kernel = |source: &shaders::ShaderSource| Kernel::new(&gpu, source.name, "main", &source.text());
+        let form = BlendForm::of(&gpu);
+        Self::with_form(gpu, form)
+    }
+
+    /// With a given form of the blending passes.
+    pub fn with_form(gpu: Arc<Gpu>, form: BlendForm) -> Result<Self, GpuError> {
+        let kernel = |source: &shaders::ShaderSource| Kernel::new(&gpu, source.name, "main", &source.text(form));
         let kernels = Kernels {
             project_forward: kernel(&shaders::PROJECT_FORWARD),
             compact_visible: kernel(&shaders::COMPACT_VISIBLE),
@@ -90,6 +98,7 @@ impl Rasterizer {
         };
         gpu.check()?;
         Ok(Self {
+            form,
             kernels,
             count_mode: GpuBuffer::uniform(&gpu, "count mode", &TileListsSetup { emit: 0, pad: [0; 3] })?,
             emit_mode: GpuBuffer::uniform(&gpu, "emit mode", &TileListsSetup { emit: 1, pad: [0; 3] })?,
@@ -100,6 +109,10 @@ impl Rasterizer {
 
     pub fn gpu(&self) -> &Arc<Gpu> {
         &self.gpu
+    }
+
+    pub fn form(&self) -> BlendForm {
+        self.form
     }
 
     /// Makes room for the view and writes its uniform.

@@ -1,6 +1,6 @@
 //! Every shader, composed of the constants, the shared parts it names, and its own file.
 
-use super::layout;
+use super::layout::{self, BlendForm};
 
 /// A composed shader, named as its stage.
 pub struct ShaderSource {
@@ -10,9 +10,9 @@ pub struct ShaderSource {
 }
 
 impl ShaderSource {
-    /// The whole WGSL text.
-    pub fn text(&self) -> String {
-        let constants = layout::wgsl_constants();
+    /// The whole WGSL text; only the blending passes depend on the form.
+    pub fn text(&self, form: BlendForm) -> String {
+        let constants = layout::wgsl_constants(form);
         std::iter::once(constants.as_str()).chain(self.parts.iter().copied()).collect::<Vec<_>>().join("\n")
     }
 }
@@ -22,6 +22,7 @@ const COUNTERS: &str = include_str!("../../shaders/shared/counters.wgsl");
 const PROJECTION: &str = include_str!("../../shaders/shared/projection.wgsl");
 const HARMONICS: &str = include_str!("../../shaders/shared/spherical_harmonics.wgsl");
 const TILE: &str = include_str!("../../shaders/shared/tile.wgsl");
+const TILE_BACKWARD: &str = include_str!("../../shaders/shared/tile_backward.wgsl");
 const PIXEL_WINDOW: &str = include_str!("../../shaders/shared/pixel_window.wgsl");
 const SINK_GRADIENT: &str = include_str!("../../shaders/shared/sink_gradient.wgsl");
 const SINK_ADAM: &str = include_str!("../../shaders/shared/sink_adam.wgsl");
@@ -49,7 +50,8 @@ shaders! {
     LOSS_FORWARD = "loss_forward", "loss_forward", [PIXEL_WINDOW], ["main"];
     LOSS_BACKWARD = "loss_backward", "loss_backward", [PIXEL_WINDOW], ["main"];
     LOSS_REDUCE = "loss_reduce", "loss_reduce", [], ["main"];
-    RASTERIZE_BACKWARD = "rasterize_backward", "rasterize_backward", [VIEW, TILE], ["main"];
+    RASTERIZE_BACKWARD_PIXELS = "rasterize_backward", "rasterize_backward_pixels", [VIEW, TILE, TILE_BACKWARD], ["main"];
+    RASTERIZE_BACKWARD_SPLATS = "rasterize_backward", "rasterize_backward_splats", [VIEW, TILE, TILE_BACKWARD], ["main"];
     PROJECT_BACKWARD = "project_backward", "project_backward", [VIEW, COUNTERS, PROJECTION, HARMONICS, SINK_GRADIENT], ["main"];
     PROJECT_BACKWARD_ADAM = "project_backward_adam", "project_backward", [VIEW, COUNTERS, PROJECTION, HARMONICS, SINK_ADAM], ["main"];
     POSE_REDUCE = "pose_reduce", "pose_reduce", [COUNTERS], ["main"];

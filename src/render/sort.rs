@@ -1,6 +1,6 @@
 //! Scan and stable radix sort over the workspace's buffers.
 
-use super::layout::{Counter, SCAN_BLOCK, ScanSetup, SortSetup};
+use super::layout::{BlendForm, Counter, SCAN_BLOCK, SORT_BLOCK, SORT_CHUNK, ScanSetup, SortSetup};
 use super::shaders;
 use super::workspace::Workspace;
 use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, workgroups};
@@ -36,7 +36,7 @@ pub(super) struct Scan {
 
 impl Scan {
     pub fn new(gpu: &Gpu) -> Self {
-        let source = shaders::SCAN.text();
+        let source = shaders::SCAN.text(BlendForm::default());
         Self {
             reduce: Kernel::new(gpu, "scan_reduce", "reduce", &source),
             sums: Kernel::new(gpu, "scan_sums", "sums", &source),
@@ -70,7 +70,7 @@ pub(super) struct Sort {
 
 impl Sort {
     pub fn new(gpu: &Gpu) -> Self {
-        let source = shaders::SORT.text();
+        let source = shaders::SORT.text(BlendForm::default());
         Self {
             count_digits: Kernel::new(gpu, "sort_count_digits", "count_digits", &source),
             scan_digits: Kernel::new(gpu, "sort_scan_digits", "scan_digits", &source),
@@ -89,6 +89,7 @@ impl Sort {
         (counter, bits): (u32, u32),
     ) -> Result<usize, GpuError> {
         let arguments = (&ws.counters, Counter::per_block_offset(counter));
+        let chunks = (keys[0].raw().size() as u32 / 4).div_ceil(SORT_BLOCK * SORT_CHUNK);
         let passes = bits.div_ceil(DIGIT_BITS);
         for digit in 0..passes {
             let (from, to) = ((digit % 2) as usize, ((digit + 1) % 2) as usize);
@@ -96,7 +97,7 @@ impl Sort {
             let shared = [(0, &setup), (1, &ws.counters)];
             let count = [shared[0], shared[1], (2, &keys[from]), (4, &ws.histogram)];
             self.count_digits.dispatch_indirect(gpu, pass, &count, arguments);
-            self.scan_digits.dispatch(gpu, pass, &[(0, &setup), (1, &ws.counters), (4, &ws.histogram)], [1, 1, 1]);
+            self.scan_digits.dispatch(gpu, pass, &[shared[0], shared[1], (4, &ws.histogram)], workgroups(chunks));
             let scatter = [
                 shared[0],
                 shared[1],

@@ -1,6 +1,6 @@
 //! The rasterizer's scratch buffers, grown when a view needs more.
 
-use super::layout::{COUNTERS, Counter, SCAN_BLOCK, SORT_BLOCK, View};
+use super::layout::{COUNTERS, Counter, SCAN_BLOCK, SORT_BLOCK, SORT_CHUNK, View};
 use crate::gpu::{Gpu, GpuBuffer, GpuError};
 
 /// Bytes of one pair's gradient: three vec4.
@@ -100,7 +100,7 @@ impl Workspace {
 
     fn reserve_histogram(&mut self, gpu: &Gpu) -> Result<(), GpuError> {
         let blocks = (self.capacity.max(self.pair_capacity) as u64).div_ceil(u64::from(SORT_BLOCK));
-        self.histogram = GpuBuffer::storage(gpu, "histogram", blocks * 256 * 4)?;
+        self.histogram = GpuBuffer::storage(gpu, "histogram", (blocks + blocks.div_ceil(u64::from(SORT_CHUNK))) * 256 * 4)?;
         Ok(())
     }
 
