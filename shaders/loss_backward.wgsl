@@ -19,6 +19,7 @@ struct Partials {
     at: array<vec3<f32>, 4>,
 }
 
+// A workgroup covers 16×16 pixels.
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_index) local: u32) {
     // Four pixels of one column.
@@ -30,21 +31,24 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
     let per_pixel = 1.0 / f32(pixels);
     let end = select(0u, min(4u, setup.height - min(y, setup.height)), x < setup.width);
     var gradient: array<vec4<f32>, 4>;
+    var rendered: array<vec4<f32>, 4>;
+    var wanted: array<vec4<f32>, 4>;
+    for (var k = 0u; k < end; k++) {
+        rendered[k] = color_depth[(y + k) * setup.width + x];
+        wanted[k] = unpack4x8unorm(target_color[(y + k) * setup.width + x]);
+    }
     for (var channel = 0u; channel < 3u; channel++) {
         let stride = bordered(setup.width);
         let corner = (channel * bordered(setup.height) + workgroup.y * 16u) * stride + workgroup.x * 16u;
         workgroupBarrier();
-        for (var item = local; item < SPAN * 4u; item += 64u) {
+        for (var item = local; item < 104u; item += 64u) {
             filter_row(corner + item / 4u * stride + item % 4u * 4u, item * 4u);
         }
         workgroupBarrier();
         let filtered = filter_column(column, row);
         for (var k = 0u; k < end; k++) {
-            let index = (y + k) * setup.width + x;
-            let rendered = color_depth[index][channel];
-            let wanted = unpack4x8unorm(target_color[index])[channel];
-            let ssim = dot(filtered.at[k], vec3(1.0, 2.0 * rendered, wanted));
-            let l1 = sign(rendered - wanted);
+            let ssim = dot(filtered.at[k], vec3(1.0, 2.0 * rendered[k][channel], wanted[k][channel]));
+            let l1 = sign(rendered[k][channel] - wanted[k][channel]);
             gradient[k][channel] = ((1.0 - setup.ssim_weight) * l1 - setup.ssim_weight * ssim) * per_pixel / 3.0;
         }
     }
@@ -53,7 +57,7 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
         var gradient_alpha = 0.0;
         let measured = target_depth[index];
         if setup.depth_weight > 0.0 && measured > 0.0 {
-            let residual = color_depth[index].w - (1.0 - state[index].x) * measured;
+            let residual = rendered[k].w - (1.0 - state[index].x) * measured;
             gradient[k].w = sign(residual) * setup.depth_weight * per_pixel;
             gradient_alpha = -gradient[k].w * measured;
         }

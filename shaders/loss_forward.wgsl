@@ -16,10 +16,9 @@
 const C1: f32 = 0.0001;
 const C2: f32 = 0.0009;
 
-var<workgroup> source: array<vec2<f32>, 676>;
-// [26 rows, 16 columns] filtered along rows.
-var<workgroup> rows: array<vec4<f32>, 416>;
-var<workgroup> sums: array<vec4<f32>, 64>;
+// Filtered along rows: [3 channels, 18 rows, 16 columns].
+var<workgroup> rows: array<vec4<f32>, 864>;
+var<workgroup> sums: array<vec4<f32>, 32>;
 
 // Filtered (x, y, x² + y², xy) of four outputs: SSIM needs the variances' sum only.
 struct Moments {
@@ -33,69 +32,60 @@ struct Ssim {
     by_product: vec4<f32>,
 }
 
-@compute @workgroup_size(64)
+// A workgroup covers 16×8 pixels.
+@compute @workgroup_size(32)
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
 ) {
+    let first = vec2(workgroup.x * 16u, workgroup.y * 8u);
+    for (var item = local; item < 72u; item += 32u) {
+        filter_row(first, item / 4u, item % 4u * 4u);
+    }
+    workgroupBarrier();
     // Four pixels of one column.
     let column = local % 16u;
     let row = local / 16u * 4u;
-    let x = workgroup.x * 16u + column;
-    let y = workgroup.y * 16u + row;
+    let x = first.x + column;
+    let y = first.y + row;
+    let ssim = array<Ssim, 3>(
+        ssim_of(filter_column(0u, column, row)),
+        ssim_of(filter_column(1u, column, row)),
+        ssim_of(filter_column(2u, column, row)),
+    );
+    let stride = bordered(setup.width);
+    let plane = stride * bordered(setup.height);
     var sum = vec4(0.0);
-    let inside = select(vec4(0.0), vec4(1.0), (vec4(y) + vec4(0u, 1u, 2u, 3u) < vec4(setup.height)) & vec4(x < setup.width));
-    for (var channel = 0u; channel < 3u; channel++) {
-        workgroupBarrier();
-        load_tile(workgroup.xy, channel, local);
-        workgroupBarrier();
-        for (var item = local; item < SPAN * 4u; item += 64u) {
-            filter_row(item / 4u, item % 4u * 4u);
-        }
-        workgroupBarrier();
-        let ssim = ssim_of(filter_column(column, row));
-        let own = (row + RADIUS) * SPAN + column + RADIUS;
-        for (var k = 0u; k < 4u; k++) {
-            if inside[k] > 0.0 {
-                let to = (channel * bordered(setup.height) + y + k + RADIUS) * bordered(setup.width) + x + RADIUS;
-                partials[to] = vec4(ssim.by_mean[k], ssim.by_square[k], ssim.by_product[k], 0.0);
-            }
-            let pair = source[own + k * SPAN];
-            let error = pair.x - pair.y;
-            sum += inside[k] * vec4(abs(error), ssim.value[k], 0.0, error * error);
-        }
-    }
     for (var k = 0u; k < 4u; k++) {
-        if inside[k] > 0.0 {
-            let index = (y + k) * setup.width + x;
-            let measured = target_depth[index];
-            if setup.depth_weight > 0.0 && measured > 0.0 {
-                sum.z += abs(color_depth[index].w - (1.0 - state[index].x) * measured);
-            }
+        if x >= setup.width || y + k >= setup.height {
+            continue;
+        }
+        let to = (y + k + RADIUS) * stride + x + RADIUS;
+        for (var channel = 0u; channel < 3u; channel++) {
+            let s = ssim[channel];
+            partials[channel * plane + to] = vec4(s.by_mean[k], s.by_square[k], s.by_product[k], 0.0);
+            sum.y += s.value[k];
+        }
+        let index = (y + k) * setup.width + x;
+        let rendered = color_depth[index];
+        let error = rendered.xyz - unpack4x8unorm(target_color[index]).xyz;
+        let measured = target_depth[index];
+        sum.x += abs(error.x) + abs(error.y) + abs(error.z);
+        sum.w += dot(error, error);
+        if setup.depth_weight > 0.0 && measured > 0.0 {
+            sum.z += abs(rendered.w - (1.0 - state[index].x) * measured);
         }
     }
     sums[local] = sum;
-    for (var stride = 32u; stride > 0u; stride /= 2u) {
+    for (var half = 16u; half > 0u; half /= 2u) {
         workgroupBarrier();
-        if local < stride {
-            sums[local] += sums[local + stride];
+        if local < half {
+            sums[local] += sums[local + half];
         }
     }
     if local == 0u {
         loss_sums[workgroup.y * workgroups.x + workgroup.x] = sums[0];
-    }
-}
-
-fn load_tile(workgroup: vec2<u32>, channel: u32, local: u32) {
-    for (var k = local; k < SPAN * SPAN; k += 64u) {
-        let pixel = vec2<i32>(workgroup * 16u + vec2(k % SPAN, k / SPAN)) - i32(RADIUS);
-        var value = vec2(0.0);
-        if all(pixel >= vec2(0)) && pixel.x < i32(setup.width) && pixel.y < i32(setup.height) {
-            let i = u32(pixel.y) * setup.width + u32(pixel.x);
-            value = vec2(color_depth[i][channel], unpack4x8unorm(target_color[i])[channel]);
-        }
-        source[k] = value;
     }
 }
 
@@ -115,37 +105,60 @@ fn add(sum: ptr<function, Moments>, value: vec4<f32>, taps: vec4<f32>) {
     }
 }
 
-fn quantities(at: u32) -> vec4<f32> {
-    let value = source[at];
-    return vec4(value, dot(value, value), value.x * value.y);
+fn quantities(x: f32, y: f32) -> vec4<f32> {
+    return vec4(x, y, x * x + y * y, x * y);
 }
 
-// Four outputs of one row, from column `first` of the tile on.
-fn filter_row(row: u32, first: u32) {
-    let at = row * SPAN + first;
-    var sum: Moments;
-    add(&sum, quantities(at + 0u), T0);
-    add(&sum, quantities(at + 1u), T1);
-    add(&sum, quantities(at + 2u), T2);
-    add(&sum, quantities(at + 3u), T3);
-    add(&sum, quantities(at + 4u), T4);
-    add(&sum, quantities(at + 5u), T5);
-    add(&sum, quantities(at + 6u), T6);
-    add(&sum, quantities(at + 7u), T7);
-    add(&sum, quantities(at + 8u), T8);
-    add(&sum, quantities(at + 9u), T9);
-    add(&sum, quantities(at + 10u), T10);
-    add(&sum, quantities(at + 11u), T11);
-    add(&sum, quantities(at + 12u), T12);
-    add(&sum, quantities(at + 13u), T13);
+// Adds the pixel at (x, y), zero beyond the image.
+fn add_pixel(
+    x: i32,
+    y: i32,
+    red: ptr<function, Moments>,
+    green: ptr<function, Moments>,
+    blue: ptr<function, Moments>,
+    taps: vec4<f32>,
+) {
+    let inside = x >= 0 && y >= 0 && x < i32(setup.width) && y < i32(setup.height);
+    let index = select(0u, u32(y) * setup.width + u32(x), inside);
+    let rendered = select(vec3(0.0), color_depth[index].xyz, inside);
+    let wanted = select(vec3(0.0), unpack4x8unorm(target_color[index]).xyz, inside);
+    add(red, quantities(rendered.x, wanted.x), taps);
+    add(green, quantities(rendered.y, wanted.y), taps);
+    add(blue, quantities(rendered.z, wanted.z), taps);
+}
+
+// Four outputs of one row of the tile's border and inside, from column `column` on.
+fn filter_row(first: vec2<u32>, row: u32, column: u32) {
+    let x = i32(first.x + column) - i32(RADIUS);
+    let y = i32(first.y + row) - i32(RADIUS);
+    var red: Moments;
+    var green: Moments;
+    var blue: Moments;
+    add_pixel(x + 0, y, &red, &green, &blue, T0);
+    add_pixel(x + 1, y, &red, &green, &blue, T1);
+    add_pixel(x + 2, y, &red, &green, &blue, T2);
+    add_pixel(x + 3, y, &red, &green, &blue, T3);
+    add_pixel(x + 4, y, &red, &green, &blue, T4);
+    add_pixel(x + 5, y, &red, &green, &blue, T5);
+    add_pixel(x + 6, y, &red, &green, &blue, T6);
+    add_pixel(x + 7, y, &red, &green, &blue, T7);
+    add_pixel(x + 8, y, &red, &green, &blue, T8);
+    add_pixel(x + 9, y, &red, &green, &blue, T9);
+    add_pixel(x + 10, y, &red, &green, &blue, T10);
+    add_pixel(x + 11, y, &red, &green, &blue, T11);
+    add_pixel(x + 12, y, &red, &green, &blue, T12);
+    add_pixel(x + 13, y, &red, &green, &blue, T13);
+    let to = row * 16u + column;
     for (var k = 0u; k < 4u; k++) {
-        rows[row * 16u + first + k] = sum.at[k];
+        rows[to + k] = red.at[k];
+        rows[288u + to + k] = green.at[k];
+        rows[576u + to + k] = blue.at[k];
     }
 }
 
 // Four outputs of one column, from row `first` of the tile on.
-fn filter_column(column: u32, first: u32) -> Moments {
-    let at = first * 16u + column;
+fn filter_column(channel: u32, column: u32, first: u32) -> Moments {
+    let at = channel * 288u + first * 16u + column;
     var sum: Moments;
     add(&sum, rows[at + 0u], T0);
     add(&sum, rows[at + 16u], T1);

@@ -1,8 +1,7 @@
-// The 11-tap Gaussian window (σ = 1.5 pixels) of SSIM (Wang et al. 2004), zero beyond the image, and the tiling that both loss
-// passes share: a workgroup of 64 covers 16×16 pixels with a border of 5. Each invocation filters four outputs side by side, so that an
+// The 11-tap Gaussian window (σ = 1.5 pixels) of SSIM (Wang et al. 2004), zero beyond the image, as both
+// loss passes use it. Each invocation filters four outputs side by side, so that an
 // input is loaded once for all four, and the quantities that are filtered together are the lanes of a vector.
 const RADIUS: u32 = 5u;
-const SPAN: u32 = 26u;
 const W0: f32 = 0.00102838;
 const W1: f32 = 0.00759876;
 const W2: f32 = 0.03600077;

@@ -19,12 +19,22 @@ struct AdamSetup {
 @group(0) @binding(8) var<storage, read_write> moments_2: array<vec4<f32>>;
 @group(0) @binding(9) var<uniform> adam: AdamSetup;
 
+// Bias corrections 1/(1 - βⁿ) of the first and the second moments after this step: of all planes, and of the higher harmonics.
+var<private> corrections: vec2<f32>;
+var<private> corrections_of_harmonics: vec2<f32>;
+
 // Lane w of planes 1 and 3 is free; in the first moments these count the Gaussian's steps, of all and of its higher harmonics.
 fn begin_gradient(i: u32) {
-    moments_1[view.capacity + i].w += 1.0;
+    corrections = count_step(view.capacity + i);
     if adam.step_harmonics == 1u {
-        moments_1[3u * view.capacity + i].w += 1.0;
+        corrections_of_harmonics = count_step(3u * view.capacity + i);
     }
+}
+
+fn count_step(at: u32) -> vec2<f32> {
+    let steps = moments_1[at].w + 1.0;
+    moments_1[at].w = steps;
+    return 1.0 / (1.0 - exp(steps * vec2(adam.log_beta_1, adam.log_beta_2)));
 }
 
 fn wants_harmonics() -> bool {
@@ -33,15 +43,14 @@ fn wants_harmonics() -> bool {
 
 fn store_gradient(plane: u32, i: u32, raw: vec4<f32>) {
     let at = plane * view.capacity + i;
-    let steps = moments_1[select(1u, 3u, plane > 3u) * view.capacity + i].w;
+    let correction = select(corrections, corrections_of_harmonics, plane > 3u);
     // A gradient that overflowed (or NaN) moves nothing.
     let gradient = select(vec4(0.0), raw, abs(raw) < vec4(1e15));
-    let m = mix(gradient, moments_1[at], adam.beta_1);
+    let before = moments_1[at];
+    let m = mix(gradient, before, adam.beta_1);
     let v = mix(gradient * gradient, moments_2[at], adam.beta_2);
-    let unbiased_m = m / (1.0 - exp(steps * adam.log_beta_1));
-    let unbiased_v = v / (1.0 - exp(steps * adam.log_beta_2));
-    let rate = adam.rates[min(plane, 4u)];
-    parameters[at] -= rate * unbiased_m / (sqrt(unbiased_v) + adam.epsilon);
-    moments_1[at] = select(m, vec4(m.xyz, moments_1[at].w), plane == 1u || plane == 3u);
+    let rate = adam.rates[min(plane, 4u)] * correction.x;
+    parameters[at] -= rate * m / (sqrt(v * correction.y) + adam.epsilon);
+    moments_1[at] = select(m, vec4(m.xyz, before.w), plane == 1u || plane == 3u);
     moments_2[at] = v;
 }

@@ -45,6 +45,8 @@ pub struct StepReport {
     /// Wall time per step, submitted in batches: median.
     pub step_ms: f64,
     pub floor_ms: f64,
+    /// The host's time to encode and submit a step, while the GPU works on others.
+    pub encode_ms: f64,
     /// Forward evaluations per second of `rasterize_forward`.
     pub evaluations_per_s: Option<f64>,
     pub stages: Vec<StageReport>,
@@ -75,6 +77,7 @@ pub fn bench_step(gpu: &Arc<Gpu>, bench: &StepBench, rates: &Rates) -> Result<St
         optimiser.steps(&mut rasterizer, &scene.cloud, &views[..1], configs)?;
     }
     gpu.take_profile()?;
+    let encoded_before = optimiser.encode_time();
     let mut walls = Vec::new();
     let mut times: BTreeMap<&str, f64> = BTreeMap::new();
     let mut steps = 0;
@@ -104,6 +107,7 @@ pub fn bench_step(gpu: &Arc<Gpu>, bench: &StepBench, rates: &Rates) -> Result<St
         work,
         step_ms: walls[walls.len() / 2],
         floor_ms: floors.values().sum(),
+        encode_ms: (optimiser.encode_time() - encoded_before).as_secs_f64() * 1e3 / steps as f64,
         evaluations_per_s: forward.map(|s| work.evaluations as f64 / (s.ms * 1e-3)),
         stages,
     })

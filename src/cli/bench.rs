@@ -131,4 +131,5 @@ fn print(r: &StepReport) {
     }
     let rate = r.evaluations_per_s.map_or_else(String::new, |e| format!("   {:.0} M forward evaluations/s", e * 1e-6));
     println!("  {:<24}{:>9.3} ms   floor {:>8.3} ms{rate}", "whole step (wall)", r.step_ms, r.floor_ms);
+    println!("  {:<24}{:>9.3} ms", "encoding (host)", r.encode_ms);
 }

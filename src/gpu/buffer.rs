@@ -13,6 +13,8 @@ use super::{Gpu, GpuError};
 pub struct GpuBuffer {
     raw: wgpu::Buffer,
     memory: Arc<MemoryCount>,
+    /// Tells this buffer from every other; gone when it is.
+    identity: Arc<()>,
 }
 
 impl GpuBuffer {
@@ -40,7 +42,11 @@ impl GpuBuffer {
         let raw =
             gpu.device.create_buffer(&wgpu::BufferDescriptor { label: Some(label), size, usage, mapped_at_creation: false });
         gpu.memory.add(size);
-        Ok(Self { raw, memory: gpu.memory.clone() })
+        Ok(Self { raw, memory: gpu.memory.clone(), identity: Arc::default() })
+    }
+
+    pub(super) fn identity(&self) -> &Arc<()> {
+        &self.identity
     }
 
     pub fn raw(&self) -> &wgpu::Buffer {

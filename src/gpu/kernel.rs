@@ -1,6 +1,11 @@
 //! One compute pipeline with its bindings, which are read from the shader itself.
 
+use std::sync::{Arc, Mutex, PoisonError, Weak};
+
 use super::{Gpu, GpuBuffer};
+
+/// Bind groups that a kernel keeps for the next dispatch over the same buffers.
+const KEPT: usize = 32;
 
 /// A compiled entry point.
 #[derive(Debug)]
@@ -8,6 +13,27 @@ pub struct Kernel {
     pipeline: wgpu::ComputePipeline,
     layout: wgpu::BindGroupLayout,
     label: &'static str,
+    groups: Mutex<Vec<Group>>,
+}
+
+/// A bind group, and what it was made of.
+#[derive(Debug)]
+struct Group {
+    made_of: Vec<(u32, Weak<()>)>,
+    group: wgpu::BindGroup,
+}
+
+impl Group {
+    fn is_of(&self, bindings: &[(u32, &GpuBuffer)]) -> bool {
+        let same = |((binding, identity), (other, buffer)): (&(u32, Weak<()>), &(u32, &GpuBuffer))| {
+            binding == other && identity.as_ptr() == Arc::as_ptr(buffer.identity())
+        };
+        self.made_of.len() == bindings.len() && self.made_of.iter().zip(bindings).all(same)
+    }
+
+    fn is_alive(&self) -> bool {
+        self.made_of.iter().all(|(_, identity)| identity.strong_count() > 0)
+    }
 }
 
 /// Dispatch size for `count` workgroups: beyond 65,535 they continue in a second dimension (`linear_workgroup` in the shaders).
@@ -29,26 +55,36 @@ impl Kernel {
             module: &module,
             entry_point: Some(entry_point),
             compilation_options: wgpu::PipelineCompilationOptions {
-                // The rasterizer counts finished invocations from zero.
+                // Counts and masks in workgroup memory start from zero.
                 zero_initialize_workgroup_memory: true,
                 ..Default::default()
             },
             cache: None,
         });
         let layout = pipeline.get_bind_group_layout(0);
-        Self { pipeline, layout, label }
+        Self { pipeline, layout, label, groups: Mutex::default() }
     }
 
+    /// The bind group over these buffers, made anew only where it is not at hand: making one costs more than a dispatch.
     fn bind(&self, gpu: &Gpu, bindings: &[(u32, &GpuBuffer)]) -> wgpu::BindGroup {
+        let mut groups = self.groups.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(found) = groups.iter().find(|group| group.is_of(bindings)) {
+            return found.group.clone();
+        }
+        // Buffers that were replaced by larger ones must not be kept.
+        groups.retain(Group::is_alive);
+        if groups.len() == KEPT {
+            groups.remove(0);
+        }
         let entries: Vec<wgpu::BindGroupEntry> = bindings
             .iter()
             .map(|(binding, buffer)| wgpu::BindGroupEntry { binding: *binding, resource: buffer.raw().as_entire_binding() })
             .collect();
-        gpu.device.create_bind_group(&wgpu::BindGroupDescriptor {
-            label: Some(self.label),
-            layout: &self.layout,
-            entries: &entries,
-        })
+        let descriptor = wgpu::BindGroupDescriptor { label: Some(self.label), layout: &self.layout, entries: &entries };
+        let group = gpu.device.create_bind_group(&descriptor);
+        let made_of = bindings.iter().map(|(binding, buffer)| (*binding, Arc::downgrade(buffer.identity()))).collect();
+        groups.push(Group { made_of, group: group.clone() });
+        group
     }
 
     /// Runs with a size known on the host.

@@ -1,10 +1,12 @@
 //! One training step on the GPU: forward, loss, backward, Adam; and the same without stepping, for whoever wants the gradients.
 
+use std::time::{Duration, Instant};
+
 use bytemuck::{Pod, Zeroable};
 
 use super::{AdamConfig, LossConfig, LossTerms, TargetImage};
 use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, workgroups};
-use crate::render::layout::{COUNTERS, Counter, LossSetup, VISIBLE_COUNTER, View};
+use crate::render::layout::{AdamSetup, COUNTERS, Counter, LossSetup, VISIBLE_COUNTER, View};
 use crate::render::{BlendForm, GpuCloud, PreparedView, Rasterizer, ViewCounts, cloud_from_planes, shaders};
 use crate::splat::{GaussianCloud, ViewCamera};
 
@@ -57,7 +59,7 @@ enum Objective<'a> {
 
 /// What the backward pass ends in.
 enum Sink<'a> {
-    Adam(&'a GpuBuffer),
+    Adam,
     Gradient(&'a GpuBuffer),
 }
 
@@ -76,8 +78,11 @@ struct Kernels {
 #[derive(Debug)]
 pub struct Optimiser {
     kernels: Kernels,
-    /// Steps submitted so far.
+    /// Steps submitted so far, and the host's time to encode and submit them.
     steps: usize,
+    encode_time: Duration,
+    adam: GpuBuffer,
+    loss_setup: GpuBuffer,
     /// Width and height that the buffers per pixel are for.
     size: (u32, u32),
     gaussians: usize,
@@ -111,6 +116,9 @@ impl Optimiser {
         Ok(Self {
             kernels,
             steps: 0,
+            encode_time: Duration::ZERO,
+            adam: GpuBuffer::uniform(gpu, "Adam", &AdamSetup::zeroed())?,
+            loss_setup: GpuBuffer::uniform(gpu, "loss setup", &LossSetup::zeroed())?,
             size: (0, 0),
             gaussians: 0,
             partials: empty("loss partials")?,
@@ -139,19 +147,15 @@ impl Optimiser {
         while !pending.is_empty() {
             for (entry, &i) in pending.iter().enumerate() {
                 let TrainingView { camera, target } = &views[i];
-                let adam = GpuBuffer::uniform(&gpu, "Adam", &adam.setup(self.steps))?;
+                let started = Instant::now();
+                self.adam.write(&gpu, 0, &[adam.setup(self.steps)]);
                 self.steps += 1;
                 let mut encoder = gpu.device.create_command_encoder(&Default::default());
-                self.encode(
-                    &mut encoder,
-                    rasterizer,
-                    cloud,
-                    (camera, [0.0; 3]),
-                    &Objective::Image(target, loss),
-                    &Sink::Adam(&adam),
-                )?;
+                self.encode(&mut encoder, rasterizer, cloud, (camera, [0.0; 3]), &Objective::Image(target, loss), &Sink::Adam)?;
                 self.encode_log(&mut encoder, rasterizer, &log, entry);
-                gpu.queue.submit([encoder.finish()]);
+                let commands = encoder.finish();
+                self.encode_time += started.elapsed();
+                gpu.queue.submit([commands]);
             }
             let entries: Vec<StepLog> = log.read(&gpu, 0, pending.len())?;
             let mut repeat = Vec::new();
@@ -170,6 +174,11 @@ impl Optimiser {
             pending = repeat;
         }
         Ok(reports)
+    }
+
+    /// The host's time to encode and submit all steps so far.
+    pub fn encode_time(&self) -> Duration {
+        self.encode_time
     }
 
     fn encode_log(&self, encoder: &mut wgpu::CommandEncoder, rasterizer: &Rasterizer, log: &GpuBuffer, entry: usize) {
@@ -269,34 +278,34 @@ impl Optimiser {
             encoder.clear_buffer(buffer.raw(), 0, None);
         }
         let mut pass = encoder.begin_compute_pass(&Default::default());
-        rasterizer.encode_forward(&mut pass, cloud, &prepared)?;
+        rasterizer.encode_forward(&mut pass, cloud, &prepared);
         if let Objective::Image(target, loss) = objective {
-            self.encode_loss(&mut pass, rasterizer, target, loss)?;
+            self.encode_loss(&mut pass, rasterizer, target, loss);
         }
         self.encode_backward(&mut pass, rasterizer, cloud, &prepared, sink);
         gpu.mark(&mut pass, "end");
         Ok(())
     }
 
-    fn encode_loss(
-        &self,
-        pass: &mut wgpu::ComputePass<'_>,
-        rasterizer: &Rasterizer,
-        target: &TargetImage,
-        loss: &LossConfig,
-    ) -> Result<(), GpuError> {
+    fn encode_loss(&self, pass: &mut wgpu::ComputePass<'_>, rasterizer: &Rasterizer, target: &TargetImage, loss: &LossConfig) {
         let (gpu, ws, k) = (rasterizer.gpu(), &rasterizer.workspace, &self.kernels);
         let (width, height) = (target.width, target.height);
         let setup = LossSetup { width, height, ssim_weight: loss.ssim_weight, depth_weight: loss.depth_weight };
-        let setup = GpuBuffer::uniform(gpu, "loss setup", &setup)?;
-        let size = [width.div_ceil(LOSS_TILE), height.div_ceil(LOSS_TILE), 1];
-        let inputs =
-            [(0, &setup), (1, &ws.color_depth), (2, &ws.state), (3, &target.color), (4, &target.depth), (5, &self.partials)];
+        self.loss_setup.write(gpu, 0, &[setup]);
+        let forward = [width.div_ceil(LOSS_TILE), height.div_ceil(LOSS_TILE / 2), 1];
+        let backward = [width.div_ceil(LOSS_TILE), height.div_ceil(LOSS_TILE), 1];
+        let inputs = [
+            (0, &self.loss_setup),
+            (1, &ws.color_depth),
+            (2, &ws.state),
+            (3, &target.color),
+            (4, &target.depth),
+            (5, &self.partials),
+        ];
         let with = |last| inputs.iter().copied().chain([last]).collect::<Vec<_>>();
-        k.loss_forward.dispatch(gpu, pass, &with((6, &self.loss_sums)), size);
+        k.loss_forward.dispatch(gpu, pass, &with((6, &self.loss_sums)), forward);
         k.loss_reduce.dispatch(gpu, pass, &[(0, &self.loss_sums), (1, &self.loss_total)], [1, 1, 1]);
-        k.loss_backward.dispatch(gpu, pass, &with((6, &self.image_gradients)), size);
-        Ok(())
+        k.loss_backward.dispatch(gpu, pass, &with((6, &self.image_gradients)), backward);
     }
 
     fn encode_backward(
@@ -309,7 +318,7 @@ impl Optimiser {
     ) {
         let (gpu, ws, k) = (rasterizer.gpu(), &rasterizer.workspace, &self.kernels);
         let blend = [
-            (0, &prepared.uniform),
+            (0, rasterizer.view()),
             (1, &ws.ranges),
             (2, &ws.slots[prepared.sorted]),
             (3, &ws.slot_gaussians),
@@ -321,7 +330,7 @@ impl Optimiser {
         ];
         k.rasterize_backward.dispatch(gpu, pass, &blend, workgroups(prepared.view.tiles()));
         let mut project = vec![
-            (0, &prepared.uniform),
+            (0, rasterizer.view()),
             (1, &ws.counters),
             (2, &ws.order[0]),
             (3, &ws.pair_offsets),
@@ -331,8 +340,8 @@ impl Optimiser {
         ];
         let arguments = (&ws.counters, Counter::per_element_offset(VISIBLE_COUNTER));
         let kernel = match sink {
-            Sink::Adam(setup) => {
-                project.extend([(7, cloud.moments_1()), (8, cloud.moments_2()), (9, *setup)]);
+            Sink::Adam => {
+                project.extend([(7, cloud.moments_1()), (8, cloud.moments_2()), (9, &self.adam)]);
                 &k.project_backward_adam
             }
             Sink::Gradient(buffer) => {
@@ -353,7 +362,7 @@ impl Optimiser {
     fn reserve(&mut self, gpu: &Gpu, view: &View, cloud: &GpuCloud) -> Result<(), GpuError> {
         if (view.width, view.height) != self.size {
             let pixels = u64::from(view.pixels());
-            let blocks = u64::from(view.width.div_ceil(LOSS_TILE) * view.height.div_ceil(LOSS_TILE));
+            let blocks = u64::from(view.width.div_ceil(LOSS_TILE) * view.height.div_ceil(LOSS_TILE / 2));
             let bordered = u64::from(bordered(view.width)) * u64::from(bordered(view.height));
             self.partials = GpuBuffer::storage(gpu, "loss partials", bordered * 48)?;
             self.image_gradients = GpuBuffer::storage(gpu, "image gradients", pixels * 32)?;

@@ -5,10 +5,12 @@
 
 use std::sync::Arc;
 
+use bytemuck::Zeroable;
+
 use super::cloud::GpuCloud;
-use super::layout::{BlendForm, COUNTERS, Counter, PAIR_COUNTER, TileListsSetup, VISIBLE_COUNTER, View};
+use super::layout::{BlendForm, COUNTERS, Counter, PAIR_COUNTER, ScanSetup, TileListsSetup, VISIBLE_COUNTER, View};
 use super::shaders;
-use super::sort::{Scan, ScanJob, ScanLength, Sort};
+use super::sort::{Scan, ScanJob, Sort};
 use super::workspace::Workspace;
 use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, workgroups};
 use crate::splat::ViewCamera;
@@ -65,14 +67,17 @@ pub struct Rasterizer {
     kernels: Kernels,
     count_mode: GpuBuffer,
     emit_mode: GpuBuffer,
+    // Written anew for each view. A write takes effect before the next submission, so one view at a time may be prepared.
+    view: GpuBuffer,
+    visible_scan: GpuBuffer,
+    pair_scan: GpuBuffer,
     pub workspace: Workspace,
 }
 
-/// A view prepared for encoding: its uniform, and where the sorted pairs will lie.
-#[derive(Debug)]
+/// A view prepared for encoding, and where its sorted pairs will lie.
+#[derive(Clone, Copy, Debug)]
 pub struct PreparedView {
     pub view: View,
-    pub uniform: GpuBuffer,
     /// Which of `workspace.slots` holds the sorted pairs.
     pub sorted: usize,
 }
@@ -94,7 +99,7 @@ impl Rasterizer {
             tile_ranges: kernel(&shaders::TILE_RANGES),
             rasterize_forward: kernel(&shaders::RASTERIZE_FORWARD),
             scan: Scan::new(&gpu),
-            sort: Sort::new(&gpu),
+            sort: Sort::new(&gpu)?,
         };
         gpu.check()?;
         Ok(Self {
@@ -102,6 +107,9 @@ impl Rasterizer {
             kernels,
             count_mode: GpuBuffer::uniform(&gpu, "count mode", &TileListsSetup { emit: 0, pad: [0; 3] })?,
             emit_mode: GpuBuffer::uniform(&gpu, "emit mode", &TileListsSetup { emit: 1, pad: [0; 3] })?,
+            view: GpuBuffer::uniform(&gpu, "view", &View::zeroed())?,
+            visible_scan: GpuBuffer::uniform(&gpu, "visible scan", &ScanSetup::zeroed())?,
+            pair_scan: GpuBuffer::uniform(&gpu, "pair scan", &ScanSetup::zeroed())?,
             workspace: Workspace::new(&gpu)?,
             gpu,
         })
@@ -111,11 +119,16 @@ impl Rasterizer {
         &self.gpu
     }
 
+    /// The uniform of the prepared view.
+    pub fn view(&self) -> &GpuBuffer {
+        &self.view
+    }
+
     pub fn form(&self) -> BlendForm {
         self.form
     }
 
-    /// Makes room for the view and writes its uniform.
+    /// Makes room for the view and tells the GPU of it; it must be submitted before another is prepared.
     pub fn prepare(&mut self, cloud: &GpuCloud, camera: &ViewCamera, background: [f32; 3]) -> Result<PreparedView, GpuError> {
         let mut view = View::new(camera, background);
         self.workspace.reserve_gaussians(&self.gpu, cloud.capacity())?;
@@ -126,8 +139,11 @@ impl Rasterizer {
         view.sh_degree = u32::from(cloud.sh_degree().get());
         view.pair_capacity = self.workspace.pair_capacity as u32;
         let tile_bits = u32::BITS - view.tiles().leading_zeros();
-        let uniform = GpuBuffer::uniform(&self.gpu, "view", &view)?;
-        Ok(PreparedView { view, uniform, sorted: (tile_bits.div_ceil(8) % 2) as usize })
+        self.view.write(&self.gpu, 0, &[view]);
+        let visible = ScanSetup::known(view.gaussian_count, VISIBLE_COUNTER, view.gaussian_count);
+        self.visible_scan.write(&self.gpu, 0, &[visible]);
+        self.pair_scan.write(&self.gpu, 0, &[ScanSetup::counted(VISIBLE_COUNTER, PAIR_COUNTER, view.pair_capacity)]);
+        Ok(PreparedView { view, sorted: (tile_bits.div_ceil(8) % 2) as usize })
     }
 
     /// Encodes what must precede the pass of [`Self::encode_forward`].
@@ -137,31 +153,20 @@ impl Rasterizer {
     }
 
     /// Encodes the forward pass.
-    pub fn encode_forward(
-        &self,
-        pass: &mut wgpu::ComputePass<'_>,
-        cloud: &GpuCloud,
-        prepared: &PreparedView,
-    ) -> Result<(), GpuError> {
+    pub fn encode_forward(&self, pass: &mut wgpu::ComputePass<'_>, cloud: &GpuCloud, prepared: &PreparedView) {
         let (gpu, ws, k) = (&*self.gpu, &self.workspace, &self.kernels);
-        let (view, uniform) = (&prepared.view, &prepared.uniform);
+        let (view, uniform) = (&prepared.view, &self.view);
         let count = view.gaussian_count;
         let per_gaussian = workgroups(count.div_ceil(256));
         let project = [(0, uniform), (1, cloud.parameters()), (2, &ws.projected), (3, &ws.visible)];
         k.project_forward.dispatch(gpu, pass, &project, per_gaussian);
-        let job = ScanJob {
-            values: &ws.visible,
-            prefix: &ws.prefix,
-            length: ScanLength::Known(count),
-            counter_out: VISIBLE_COUNTER,
-            capacity: count,
-        };
-        k.scan.encode(gpu, pass, ws, &job)?;
+        let job = ScanJob { setup: &self.visible_scan, values: &ws.visible, prefix: &ws.prefix, bound: count };
+        k.scan.encode(gpu, pass, ws, &job);
         let compact =
             [(0, uniform), (1, &ws.visible), (2, &ws.prefix), (3, &ws.projected), (4, &ws.depth_keys[0]), (5, &ws.order[0])];
         k.compact_visible.dispatch(gpu, pass, &compact, per_gaussian);
-        k.sort.encode(gpu, pass, ws, (&ws.depth_keys, &ws.order), (VISIBLE_COUNTER, DEPTH_KEY_BITS))?;
-        self.encode_tiles(pass, prepared)?;
+        k.sort.encode(gpu, pass, ws, (&ws.depth_keys, &ws.order), (VISIBLE_COUNTER, DEPTH_KEY_BITS));
+        self.encode_tiles(pass, prepared);
         let bindings = [
             (0, uniform),
             (1, &ws.ranges),
@@ -172,16 +177,15 @@ impl Rasterizer {
             (6, &ws.state),
         ];
         k.rasterize_forward.dispatch(gpu, pass, &bindings, workgroups(view.tiles()));
-        Ok(())
     }
 
     /// Tile lists: count, offsets, emit, stable sort by tile, ranges.
-    fn encode_tiles(&self, pass: &mut wgpu::ComputePass<'_>, prepared: &PreparedView) -> Result<(), GpuError> {
+    fn encode_tiles(&self, pass: &mut wgpu::ComputePass<'_>, prepared: &PreparedView) {
         let (gpu, ws, k) = (&*self.gpu, &self.workspace, &self.kernels);
         let visible = (&ws.counters, Counter::per_element_offset(VISIBLE_COUNTER));
         let lists = |mode| {
             [
-                (0, &prepared.uniform),
+                (0, &self.view),
                 (1, mode),
                 (2, &ws.counters),
                 (3, &ws.order[0]),
@@ -194,21 +198,15 @@ impl Rasterizer {
             ]
         };
         k.tile_lists.dispatch_indirect(gpu, pass, &lists(&self.count_mode), visible);
-        let job = ScanJob {
-            values: &ws.pair_counts,
-            prefix: &ws.pair_offsets,
-            length: ScanLength::Counter(VISIBLE_COUNTER, prepared.view.gaussian_count),
-            counter_out: PAIR_COUNTER,
-            capacity: prepared.view.pair_capacity,
-        };
-        k.scan.encode(gpu, pass, ws, &job)?;
+        let bound = prepared.view.gaussian_count;
+        let job = ScanJob { setup: &self.pair_scan, values: &ws.pair_counts, prefix: &ws.pair_offsets, bound };
+        k.scan.encode(gpu, pass, ws, &job);
         k.tile_lists.dispatch_indirect(gpu, pass, &lists(&self.emit_mode), visible);
         let tile_bits = u32::BITS - prepared.view.tiles().leading_zeros();
-        let sorted = k.sort.encode(gpu, pass, ws, (&ws.tile_keys, &ws.slots), (PAIR_COUNTER, tile_bits))?;
+        let sorted = k.sort.encode(gpu, pass, ws, (&ws.tile_keys, &ws.slots), (PAIR_COUNTER, tile_bits));
         debug_assert_eq!(sorted, prepared.sorted);
         let ranges = [(0, &ws.counters), (1, &ws.tile_keys[sorted]), (2, &ws.ranges)];
         k.tile_ranges.dispatch_indirect(gpu, pass, &ranges, (&ws.counters, Counter::per_element_offset(PAIR_COUNTER)));
-        Ok(())
     }
 
     /// Reads the counters of the last view; when its pairs did not fit, grows the buffers and returns `None`: repeat the step.
@@ -238,7 +236,7 @@ impl Rasterizer {
             let prepared = self.prepare(cloud, camera, background)?;
             let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
             self.encode_clear(&mut encoder);
-            self.encode_forward(&mut encoder.begin_compute_pass(&Default::default()), cloud, &prepared)?;
+            self.encode_forward(&mut encoder.begin_compute_pass(&Default::default()), cloud, &prepared);
             self.gpu.queue.submit([encoder.finish()]);
             if self.finish()?.is_none() {
                 continue;
