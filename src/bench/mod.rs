@@ -1,4 +1,4 @@
-//! Benchmarks that run anywhere: the training step on made-up scenes, stage by stage, beside the floor that the adapter's own
+//! Benchmarks that run anywhere: the training step, stage by stage, beside the floor that the adapter's own
 //! bandwidth and arithmetic set for the work really done.
 
 mod rates;
@@ -8,5 +8,5 @@ mod work;
 
 pub use rates::{Rates, measure_rates};
 pub use scene::BenchScene;
-pub use step::{StageReport, StepBench, StepReport, bench_step};
+pub use step::{StageReport, StepBench, StepReport, StepRunner, StepTimes, bench_step};
 pub use work::{Work, count_work};

@@ -1,4 +1,5 @@
-//! A made-up scene of any size: surfaces at several depths, filling the view in a few layers, as a mapped room would.
+//! Scenes to measure on: made-up ones of any size (surfaces at several depths, filling the view in a few layers, as a mapped room
+//! would), and views of real maps.
 
 use std::sync::Arc;
 
@@ -11,6 +12,7 @@ use crate::geometry::{Pinhole, Se3};
 use crate::gpu::{Gpu, GpuError};
 use crate::optimise::TargetImage;
 use crate::render::GpuCloud;
+use crate::sequence::RectifiedImage;
 use crate::splat::ViewCamera;
 use crate::splat::{Gaussian, GaussianCloud, ShDegree, raw_opacity_from_opacity};
 
@@ -41,6 +43,20 @@ impl BenchScene {
         let color = RgbImage::from_fn(width, height, |x, y| Rgb([(x * 7 + y) as u8, (y * 5) as u8, (x + y * 3) as u8]));
         let target = TargetImage::new(gpu, &color, Some(&vec![2.0; (width * height) as usize]))?;
         Ok(Self { cloud: on_gpu, camera: ViewCamera { pinhole, camera_from_world: Se3::identity() }, target })
+    }
+
+    /// A map seen from where a recorded image was taken.
+    pub fn of_map(
+        gpu: &Arc<Gpu>,
+        cloud: &GaussianCloud,
+        world_from_camera: &Se3,
+        recorded: &RectifiedImage,
+    ) -> Result<Self, GpuError> {
+        let mut on_gpu = GpuCloud::new(gpu, cloud.sh_degree, cloud.len())?;
+        on_gpu.append(gpu, cloud)?;
+        let camera = ViewCamera { pinhole: recorded.pinhole, camera_from_world: world_from_camera.inverse() };
+        let target = TargetImage::new(gpu, &recorded.color, recorded.depth.as_ref().map(|d| d.metres.as_slice()))?;
+        Ok(Self { cloud: on_gpu, camera, target })
     }
 }
 

@@ -1,8 +1,8 @@
 //! The training step, stage by stage, beside each stage's floor.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use serde::Serialize;
 
@@ -31,7 +31,7 @@ pub struct StepBench {
 #[derive(Clone, Debug, Serialize)]
 pub struct StageReport {
     pub stage: String,
-    /// Mean over the timed steps; absent where the adapter gives no timestamps.
+    /// Median over batches of steps; absent where the adapter gives no timestamps.
     pub ms: f64,
     /// Compulsory bytes over the bandwidth, or operations over the arithmetic rate, whichever is longer; 0 where nothing is compulsory.
     pub floor_ms: f64,
@@ -53,61 +53,109 @@ pub struct StepReport {
 }
 
 const WARM_UP: usize = 3;
+/// Steps submitted at once.
 const BATCH: usize = 4;
 
-/// Measures a training step on a made-up scene.
-pub fn bench_step(gpu: &Arc<Gpu>, bench: &StepBench, rates: &Rates) -> Result<StepReport, GpuError> {
-    let scene = BenchScene::new(gpu, bench.gaussians, (bench.width, bench.height), bench.sh_degree)?;
-    let mut rasterizer = Rasterizer::with_form(gpu.clone(), bench.form)?;
-    let mut optimiser = Optimiser::new(&rasterizer)?;
-    let work = count_work(&mut rasterizer, &scene.cloud, &scene.camera)?;
-    // Rates of zero keep the scene as it is, step after step, at the same cost.
-    let still = AdamConfig {
-        position_rate: 0.0,
-        opacity_rate: 0.0,
-        scale_rate: 0.0,
-        rotation_rate: 0.0,
-        color_rate: 0.0,
-        harmonics_rate: 0.0,
-        ..AdamConfig::default()
-    };
-    let views = [TrainingView { camera: scene.camera, target: &scene.target }; BATCH];
-    let configs = (&LossConfig::default(), &still);
-    for _ in 0..WARM_UP {
-        optimiser.steps(&mut rasterizer, &scene.cloud, &views[..1], configs)?;
-    }
-    gpu.take_profile()?;
-    let encoded_before = optimiser.encode_time();
-    let mut walls = Vec::new();
-    let mut times: BTreeMap<&str, f64> = BTreeMap::new();
-    let mut steps = 0;
-    while steps < bench.steps {
-        let started = Instant::now();
-        optimiser.steps(&mut rasterizer, &scene.cloud, &views, configs)?;
-        walls.push(started.elapsed().as_secs_f64() * 1e3 / BATCH as f64);
-        for (label, ms) in gpu.take_profile()?.unwrap_or_default() {
-            *times.entry(label).or_default() += ms;
+/// Repeats one training step on a scene that it leaves as it is.
+#[derive(Debug)]
+pub struct StepRunner {
+    gpu: Arc<Gpu>,
+    scene: BenchScene,
+    rasterizer: Rasterizer,
+    optimiser: Optimiser,
+    still: AdamConfig,
+    /// The work in one step.
+    pub work: Work,
+}
+
+/// What a few steps took.
+#[derive(Clone, Debug, Default)]
+pub struct StepTimes {
+    /// Wall time per step.
+    pub wall: Duration,
+    /// The host's share of it.
+    pub encoding: Duration,
+    /// Time on the GPU per step, by stage; empty where the adapter gives no timestamps.
+    pub stages: BTreeMap<&'static str, Duration>,
+}
+
+impl StepRunner {
+    /// `gpu` should be opened with [`Gpu::open_profiled`]. Compiles and warms up.
+    pub fn new(gpu: &Arc<Gpu>, scene: BenchScene, form: BlendForm) -> Result<Self, GpuError> {
+        let mut rasterizer = Rasterizer::with_form(gpu.clone(), form)?;
+        let optimiser = Optimiser::new(&rasterizer)?;
+        let work = count_work(&mut rasterizer, &scene.cloud, &scene.camera)?;
+        // Rates of zero keep the scene as it is, step after step, at the same cost.
+        let still = AdamConfig {
+            position_rate: 0.0,
+            opacity_rate: 0.0,
+            scale_rate: 0.0,
+            rotation_rate: 0.0,
+            color_rate: 0.0,
+            harmonics_rate: 0.0,
+            ..AdamConfig::default()
+        };
+        let mut runner = Self { gpu: gpu.clone(), scene, rasterizer, optimiser, still, work };
+        for _ in 0..WARM_UP {
+            runner.steps(1)?;
         }
-        steps += BATCH;
+        gpu.take_profile()?;
+        Ok(runner)
     }
-    walls.sort_by(f64::total_cmp);
+
+    fn steps(&mut self, count: usize) -> Result<(), GpuError> {
+        let views = [TrainingView { camera: self.scene.camera, target: &self.scene.target }; BATCH];
+        let configs = (&LossConfig::default(), &self.still);
+        self.optimiser.steps(&mut self.rasterizer, &self.scene.cloud, &views[..count], configs)?;
+        Ok(())
+    }
+
+    /// Runs a batch of steps and waits for them.
+    pub fn run(&mut self) -> Result<StepTimes, GpuError> {
+        let share = BATCH as u32;
+        let encoded = self.optimiser.encode_time();
+        let started = Instant::now();
+        self.steps(BATCH)?;
+        let wall = started.elapsed() / share;
+        let encoding = (self.optimiser.encode_time() - encoded) / share;
+        let mut stages = BTreeMap::<_, Duration>::new();
+        for (label, ms) in self.gpu.take_profile()?.unwrap_or_default() {
+            *stages.entry(label).or_default() += Duration::from_secs_f64(ms * 1e-3 / f64::from(share));
+        }
+        stages.remove(Optimiser::END_MARK);
+        Ok(StepTimes { wall, encoding, stages })
+    }
+}
+
+/// Measures a training step on a scene.
+pub fn bench_step(gpu: &Arc<Gpu>, scene: BenchScene, bench: &StepBench, rates: &Rates) -> Result<StepReport, GpuError> {
+    let mut runner = StepRunner::new(gpu, scene, bench.form)?;
+    let times = (0..bench.steps.div_ceil(BATCH)).map(|_| runner.run()).collect::<Result<Vec<_>, _>>()?;
+    let ms = |part: &dyn Fn(&StepTimes) -> Duration| {
+        let mut all: Vec<f64> = times.iter().map(|t| part(t).as_secs_f64() * 1e3).collect();
+        all.sort_by(f64::total_cmp);
+        all.get(all.len() / 2).copied().unwrap_or_default()
+    };
+    let work = runner.work;
     let floors = floors(&work, bench, rates);
     let stages: Vec<StageReport> = times
         .iter()
-        .filter(|(label, _)| **label != "end")
-        .map(|(label, ms)| StageReport {
-            stage: (*label).into(),
-            ms: ms / steps as f64,
-            floor_ms: floors.get(label).copied().unwrap_or(0.0),
+        .flat_map(|t| t.stages.keys())
+        .collect::<BTreeSet<_>>()
+        .into_iter()
+        .map(|&stage| StageReport {
+            stage: stage.into(),
+            ms: ms(&|t| t.stages.get(stage).copied().unwrap_or_default()),
+            floor_ms: floors.get(stage).copied().unwrap_or(0.0),
         })
         .collect();
     let forward = stages.iter().find(|s| s.stage == "rasterize_forward");
     Ok(StepReport {
         bench: *bench,
         work,
-        step_ms: walls[walls.len() / 2],
+        step_ms: ms(&|t| t.wall),
         floor_ms: floors.values().sum(),
-        encode_ms: (optimiser.encode_time() - encoded_before).as_secs_f64() * 1e3 / steps as f64,
+        encode_ms: ms(&|t| t.encoding),
         evaluations_per_s: forward.map(|s| work.evaluations as f64 / (s.ms * 1e-3)),
         stages,
     })

@@ -1,14 +1,21 @@
 //! `keysplat bench`
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand, ValueEnum};
-use keysplat::bench::{Rates, StepBench, StepReport, bench_step, measure_rates};
+use keysplat::bench::{BenchScene, Rates, StepBench, StepReport, bench_step, measure_rates};
+use keysplat::config::Config;
+use keysplat::export::MapFormat;
+use keysplat::geometry::{Pinhole, Se3, Trajectory};
 use keysplat::gpu::{AdapterSummary, Gpu};
+use keysplat::pipeline::outputs;
 use keysplat::render::BlendForm;
-use keysplat::splat::ShDegree;
+use keysplat::sequence::{RectifiedImage, Rectifier};
+use keysplat::splat::{GaussianCloud, ShDegree};
 use miette::{IntoDiagnostic, miette};
 use serde::Serialize;
+
+use super::run;
 
 #[derive(Args)]
 pub struct BenchArgs {
@@ -18,13 +25,16 @@ pub struct BenchArgs {
 
 #[derive(Subcommand)]
 enum What {
-    /// One training step on made-up scenes, stage by stage, beside what the adapter could do at its best.
+    /// One training step, on made-up scenes or on the map of a run, stage by stage, beside what the adapter could do at its best.
     Step(StepArgs),
 }
 
 #[derive(Args)]
 struct StepArgs {
-    /// Numbers of Gaussians.
+    /// Folder of a run whose map is seen from its middle keyframe, instead of made-up scenes.
+    #[arg(long, conflicts_with_all = ["size", "sh"])]
+    run: Option<PathBuf>,
+    /// Numbers of Gaussians; of a run's map, that many spread evenly over it.
     #[arg(long, value_delimiter = ',', default_values_t = [10_000usize, 110_000, 500_000])]
     gaussians: Vec<usize>,
     /// Image sizes.
@@ -98,16 +108,29 @@ fn step(args: &StepArgs) -> miette::Result<()> {
         println!("{} [{}, {}]", gpu.adapter.name, gpu.adapter.kind, gpu.adapter.driver);
         println!("copy {:.1} GB/s   multiply-add {:.1} GFLOP/s", rates.bytes_per_s * 1e-9, rates.flops_per_s * 1e-9);
     }
+    let mut measure = |scene: BenchScene, bench: StepBench| {
+        let measured = bench_step(&gpu, scene, &bench, &rates).into_diagnostic()?;
+        if !args.json {
+            print(&measured);
+        }
+        report.steps.push(measured);
+        Ok::<_, miette::Report>(())
+    };
+    let recorded = args.run.as_deref().map(RecordedView::open).transpose()?;
     for &gaussians in &args.gaussians {
+        if let Some(view) = &recorded {
+            let cloud = view.thinned(gaussians);
+            let Pinhole { width, height, .. } = view.image.pinhole;
+            let scene = BenchScene::of_map(&gpu, &cloud, &view.world_from_camera, &view.image).into_diagnostic()?;
+            let sh_degree = cloud.sh_degree;
+            measure(scene, StepBench { gaussians: cloud.len(), width, height, sh_degree, form, steps: args.steps })?;
+            continue;
+        }
         for &(width, height) in &args.size {
             for &degree in &args.sh {
                 let sh_degree = ShDegree::new(degree).ok_or_else(|| miette!("--sh takes degrees 0 to 3, not {degree}"))?;
-                let bench = StepBench { gaussians, width, height, sh_degree, form, steps: args.steps };
-                let measured = bench_step(&gpu, &bench, &rates).into_diagnostic()?;
-                if !args.json {
-                    print(&measured);
-                }
-                report.steps.push(measured);
+                let scene = BenchScene::new(&gpu, gaussians, (width, height), sh_degree).into_diagnostic()?;
+                measure(scene, StepBench { gaussians, width, height, sh_degree, form, steps: args.steps })?;
             }
         }
     }
@@ -119,6 +142,38 @@ fn step(args: &StepArgs) -> miette::Result<()> {
         println!("{text}");
     }
     Ok(())
+}
+
+/// A run's map, and its middle keyframe as it was recorded.
+struct RecordedView {
+    cloud: GaussianCloud,
+    world_from_camera: Se3,
+    image: RectifiedImage,
+}
+
+impl RecordedView {
+    fn open(dir: &Path) -> miette::Result<Self> {
+        let mut config = Config::read(&dir.join(outputs::CONFIG)).into_diagnostic()?;
+        let sequence = run::open(&mut config)?;
+        let keyframes = Trajectory::read_tum(&dir.join(outputs::KEYFRAMES)).into_diagnostic()?;
+        let middle =
+            keyframes.poses.get(keyframes.poses.len() / 2).ok_or_else(|| miette!("{} has no keyframes", dir.display()))?;
+        let frame = sequence.entries.partition_point(|e| e.timestamp_s < middle.timestamp_s - 1e-4);
+        let rectifier = Rectifier::new(&sequence.camera, config.map_scale);
+        let image = rectifier.rectify(&sequence.load(frame.min(sequence.entries.len() - 1)).into_diagnostic()?);
+        let cloud = MapFormat::Ply.read(&dir.join(outputs::MAP)).into_diagnostic()?;
+        Ok(Self { cloud, world_from_camera: middle.world_from_camera, image })
+    }
+
+    /// At most `count` Gaussians, spread evenly over the map.
+    fn thinned(&self, count: usize) -> GaussianCloud {
+        let mut cloud = GaussianCloud::new(self.cloud.sh_degree);
+        let count = count.min(self.cloud.len());
+        for i in 0..count {
+            cloud.push(self.cloud.get(i * self.cloud.len() / count));
+        }
+        cloud
+    }
 }
 
 fn print(r: &StepReport) {

@@ -21,8 +21,7 @@ impl GpuBuffer {
     /// Storage of `bytes` (rounded up, zeroed) that can be written, copied and used for indirect dispatch.
     pub fn storage(gpu: &Gpu, label: &str, bytes: u64) -> Result<Self, GpuError> {
         let usage = BufferUsages::STORAGE | BufferUsages::COPY_DST | BufferUsages::COPY_SRC | BufferUsages::INDIRECT;
-        let limit = gpu.device.limits().max_storage_buffer_binding_size.min(gpu.device.limits().max_buffer_size);
-        Self::create(gpu, label, bytes, usage, limit)
+        Self::create(gpu, label, bytes, usage, gpu.max_storage_bytes())
     }
 
     /// A uniform that holds `value`.

@@ -19,7 +19,8 @@ pub enum GpuError {
     #[error("the adapter {adapter} gives no device: {source}")]
     Device { adapter: String, source: wgpu::RequestDeviceError },
     #[error(
-        "{label} needs a buffer of {needed} bytes, but the adapter binds at most {limit}; lower the mapping resolution (--map-scale) or the number of Gaussians"
+        "{label}: a buffer of {} MiB is needed, but the adapter binds at most {} MiB; lower the mapping resolution (--map-scale) or the number of Gaussians",
+        needed.div_ceil(1 << 20), limit >> 20
     )]
     TooLarge { label: String, needed: u64, limit: u64 },
     #[error("the GPU ran out of memory ({0}); lower the mapping resolution (--map-scale) or the number of Gaussians")]
@@ -118,15 +119,20 @@ pub fn adapters() -> Vec<AdapterSummary> {
 impl Gpu {
     /// Opens the fastest adapter, or the first whose name contains `wanted` (any case).
     pub fn open(wanted: Option<&str>) -> Result<Arc<Self>, GpuError> {
-        Self::open_with(wanted, wgpu::Features::empty())
+        Self::open_with(wanted, wgpu::Features::empty(), u64::MAX)
     }
 
     /// The same, with timestamps where the adapter has them (see [`Self::take_profile`]).
     pub fn open_profiled(wanted: Option<&str>) -> Result<Arc<Self>, GpuError> {
-        Self::open_with(wanted, Profiler::FEATURES)
+        Self::open_with(wanted, Profiler::FEATURES, u64::MAX)
     }
 
-    fn open_with(wanted: Option<&str>, wished: wgpu::Features) -> Result<Arc<Self>, GpuError> {
+    /// The same as [`Self::open`], on an adapter made smaller: no buffer may be larger than `bytes`.
+    pub fn open_small(wanted: Option<&str>, bytes: u64) -> Result<Arc<Self>, GpuError> {
+        Self::open_with(wanted, wgpu::Features::empty(), bytes)
+    }
+
+    fn open_with(wanted: Option<&str>, wished: wgpu::Features, most: u64) -> Result<Arc<Self>, GpuError> {
         let mut adapters = sorted_adapters(&instance());
         if adapters.is_empty() {
             return Err(GpuError::NoAdapter);
@@ -143,8 +149,8 @@ impl Gpu {
         // Everything runs within WebGPU's defaults; only the sizes of buffers are asked for in full.
         let offered = adapter.limits();
         let required_limits = wgpu::Limits {
-            max_buffer_size: offered.max_buffer_size,
-            max_storage_buffer_binding_size: offered.max_storage_buffer_binding_size,
+            max_buffer_size: offered.max_buffer_size.min(most),
+            max_storage_buffer_binding_size: offered.max_storage_buffer_binding_size.min(most),
             ..wgpu::Limits::default()
         };
         let required_features = wished & adapter.features();
@@ -156,6 +162,12 @@ impl Gpu {
         watch(&device, &failure);
         let profiler = required_features.contains(Profiler::FEATURES).then(|| Profiler::new(&device));
         Ok(Arc::new(Self { device, queue, adapter: adapter.get_info().into(), failure, memory: Arc::default(), profiler }))
+    }
+
+    /// The largest storage buffer, bytes.
+    pub fn max_storage_bytes(&self) -> u64 {
+        let limits = self.device.limits();
+        limits.max_storage_buffer_binding_size.min(limits.max_buffer_size)
     }
 
     /// Whether the adapter is a program on the CPU.
@@ -197,9 +209,5 @@ fn watch(device: &wgpu::Device, failure: &Arc<Mutex<Option<Failure>>>) {
         note(&slot, found);
     }));
     let slot = failure.clone();
-    device.set_device_lost_callback(move |reason, message| {
-        if !matches!(reason, wgpu::DeviceLostReason::Destroyed) {
-            note(&slot, Failure::Failed(format!("device lost: {message}")));
-        }
-    });
+    device.set_device_lost_callback(move |_, message| note(&slot, Failure::Failed(format!("device lost: {message}"))));
 }

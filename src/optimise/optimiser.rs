@@ -95,6 +95,9 @@ pub struct Optimiser {
 }
 
 impl Optimiser {
+    /// The mark that ends a step's last stage in the profile.
+    pub const END_MARK: &'static str = "end";
+
     /// For the views that `rasterizer` renders: both passes of the blending take the same form.
     pub fn new(rasterizer: &Rasterizer) -> Result<Self, GpuError> {
         let (gpu, form) = (rasterizer.gpu(), rasterizer.form());
@@ -283,7 +286,7 @@ impl Optimiser {
             self.encode_loss(&mut pass, rasterizer, target, loss);
         }
         self.encode_backward(&mut pass, rasterizer, cloud, &prepared, sink);
-        gpu.mark(&mut pass, "end");
+        gpu.mark(&mut pass, Self::END_MARK);
         Ok(())
     }
 

@@ -67,7 +67,10 @@ impl GpuCloud {
         assert_eq!(cloud.sh_degree, self.sh_degree, "a map has one spherical-harmonics degree");
         let finite: Vec<usize> = (0..cloud.len()).filter(|&i| is_finite(cloud, i)).collect();
         if self.count + finite.len() > self.capacity {
-            let grown = (self.count + finite.len()).next_power_of_two();
+            // Twice the room, or what the adapter can bind; if that is too little, the allocation says how much is needed.
+            let needed = self.count + finite.len();
+            let most = gpu.max_storage_bytes() as usize / (self.planes() * 16);
+            let grown = needed.next_power_of_two().min(most).max(needed);
             let all: Vec<u32> = (0..self.count as u32).collect();
             self.rebuild(gpu, &all, grown)?;
         }

@@ -85,10 +85,13 @@ impl Workspace {
         self.reserve_histogram(gpu)
     }
 
-    pub(super) fn reserve_pairs(&mut self, gpu: &Gpu, capacity: usize) -> Result<(), GpuError> {
-        if capacity <= self.pair_capacity {
+    /// Makes room for `needed` pairs, and a quarter more where the adapter can bind it.
+    pub(super) fn reserve_pairs(&mut self, gpu: &Gpu, needed: usize) -> Result<(), GpuError> {
+        if needed <= self.pair_capacity {
             return Ok(());
         }
+        let most = (gpu.max_storage_bytes() / PAIR_GRADIENT_BYTES) as usize;
+        let capacity = (needed + needed / 4).min(most).max(needed);
         let words = |label: &str| GpuBuffer::storage(gpu, label, capacity as u64 * 4);
         self.tile_keys = [words("tile keys")?, words("tile keys")?];
         self.slots = [words("slots")?, words("slots")?];

@@ -1,0 +1,96 @@
+//! What happens when the GPU gives way in the middle of a run: a typed error, and everything mapped until then.
+
+mod common;
+
+use std::time::Duration;
+
+use common::recording::{ITERATIONS_PER_KEYFRAME, recording, scratch, skipped_without_adapter};
+use fastrand::Rng;
+use keysplat::config::Config;
+use keysplat::export::MapFormat;
+use keysplat::gpu::{Gpu, GpuError};
+use keysplat::mapping::MappingError;
+use keysplat::pipeline::{self, Outcome, PipelineError, Progress, outputs};
+use keysplat::render::{GpuCloud, Rasterizer};
+use keysplat::sequence::Sequence;
+use keysplat::splat::ShDegree;
+
+fn config() -> Config {
+    let mut config = Config::default();
+    config.mapping.iterations_per_keyframe = ITERATIONS_PER_KEYFRAME as usize;
+    config
+}
+
+fn gpu_error(outcome: &Outcome) -> &GpuError {
+    match &outcome.error {
+        Some(PipelineError::Mapping(MappingError::Gpu(error))) => error,
+        other => panic!("no GPU error: {other:?}"),
+    }
+}
+
+/// Writes the outcome as the program does, and reads the map back.
+fn assert_written(name: &str, outcome: &Outcome) {
+    assert!(!outcome.cloud.is_empty(), "the map of the keyframes before the failure is kept");
+    let out = scratch().join(name);
+    outputs::prepare_folder(&out).unwrap();
+    outputs::write_results(&out, outcome, &config()).unwrap();
+    assert_eq!(MapFormat::Ply.read(&out.join(outputs::MAP)).unwrap().len(), outcome.cloud.len());
+}
+
+#[test]
+fn a_lost_device_ends_the_run_with_what_was_mapped() {
+    if skipped_without_adapter() {
+        return;
+    }
+    let sequence = Sequence::open(recording(), None, None).unwrap();
+    let gpu = Gpu::open(None).unwrap();
+    let progress = Progress::default();
+    let outcome = std::thread::scope(|scope| {
+        let (gpu, progress) = (&gpu, &progress);
+        scope.spawn(move || {
+            while progress.mapping.pop().is_none() {
+                std::thread::sleep(Duration::from_millis(1));
+            }
+            gpu.device.destroy();
+        });
+        pipeline::run(&sequence, gpu, &config(), progress).unwrap()
+    });
+    assert!(matches!(gpu_error(&outcome), GpuError::Failed(_)), "{:?}", outcome.error);
+    assert_written("lost-device", &outcome);
+}
+
+/// What does not fit is refused by name and size, and what there was goes on working.
+#[test]
+fn buffers_beyond_the_adapter_are_refused_and_nothing_is_lost() {
+    if skipped_without_adapter() {
+        return;
+    }
+    const LARGEST: u64 = 8 << 20;
+    let small = Gpu::open_small(None, LARGEST).unwrap();
+    let rng = &mut Rng::with_seed(1);
+    let degree = ShDegree::default();
+    let cloud = common::scene(rng, 20_000, degree);
+    let mut map = GpuCloud::new(&small, degree, 64).unwrap();
+    map.append(&small, &cloud).unwrap();
+    let per_gaussian = map.parameters().raw().size() as usize / map.capacity();
+    // As many as fit: more than the last power of two below.
+    let room = LARGEST as usize / per_gaussian;
+    assert!(!room.is_power_of_two() || room > 2 * cloud.len());
+    map.append(&small, &common::scene(rng, room - 1000 - cloud.len(), degree)).unwrap();
+    let refused = map.append(&small, &common::scene(rng, 2000, degree)).unwrap_err();
+    assert!(matches!(refused, GpuError::TooLarge { needed, limit, .. } if needed > LARGEST && limit == LARGEST), "{refused}");
+    assert_eq!(map.len(), room - 1000);
+    let kept = map.download(&small).unwrap();
+    assert_eq!((kept.get(0), kept.get(19_999)), (cloud.get(0), cloud.get(19_999)));
+
+    let mut map = GpuCloud::new(&small, degree, 64).unwrap();
+    map.append(&small, &common::scene(rng, 300, degree)).unwrap();
+    let mut rasterizer = Rasterizer::new(small.clone()).unwrap();
+    let mut view = common::camera(rng, 64, 48);
+    let before = rasterizer.render(&map, &view, [0.0; 3]).unwrap();
+    (view.pinhole.width, view.pinhole.height) = (4096, 4096);
+    let refused = rasterizer.render(&map, &view, [0.0; 3]).unwrap_err();
+    assert!(refused.to_string().contains("256 MiB is needed, but the adapter binds at most 8 MiB"), "{refused}");
+    (view.pinhole.width, view.pinhole.height) = (64, 48);
+    assert_eq!(rasterizer.render(&map, &view, [0.0; 3]).unwrap(), before);
+}
