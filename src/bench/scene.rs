@@ -12,7 +12,6 @@ use crate::geometry::{Pinhole, Se3};
 use crate::gpu::{Gpu, GpuError};
 use crate::optimise::TargetImage;
 use crate::render::GpuCloud;
-use crate::sequence::RectifiedImage;
 use crate::splat::ViewCamera;
 use crate::splat::{Gaussian, GaussianCloud, ShDegree, raw_opacity_from_opacity};
 
@@ -45,17 +44,16 @@ impl BenchScene {
         Ok(Self { cloud: on_gpu, camera: ViewCamera { pinhole, camera_from_world: Se3::identity() }, target })
     }
 
-    /// A map seen from where a recorded image was taken.
+    /// A map from a view that was recorded.
     pub fn of_map(
         gpu: &Arc<Gpu>,
         cloud: &GaussianCloud,
-        world_from_camera: &Se3,
-        recorded: &RectifiedImage,
+        camera: ViewCamera,
+        (color, depth_metres): (&RgbImage, Option<&[f32]>),
     ) -> Result<Self, GpuError> {
         let mut on_gpu = GpuCloud::new(gpu, cloud.sh_degree, cloud.len())?;
         on_gpu.append(gpu, cloud)?;
-        let camera = ViewCamera { pinhole: recorded.pinhole, camera_from_world: world_from_camera.inverse() };
-        let target = TargetImage::new(gpu, &recorded.color, recorded.depth.as_ref().map(|d| d.metres.as_slice()))?;
+        let target = TargetImage::new(gpu, color, depth_metres)?;
         Ok(Self { cloud: on_gpu, camera, target })
     }
 }

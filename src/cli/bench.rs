@@ -11,7 +11,7 @@ use keysplat::gpu::{AdapterSummary, Gpu};
 use keysplat::pipeline::outputs;
 use keysplat::render::BlendForm;
 use keysplat::sequence::{RectifiedImage, Rectifier};
-use keysplat::splat::{GaussianCloud, ShDegree};
+use keysplat::splat::{GaussianCloud, ShDegree, ViewCamera};
 use miette::{IntoDiagnostic, miette};
 use serde::Serialize;
 
@@ -121,7 +121,9 @@ fn step(args: &StepArgs) -> miette::Result<()> {
         if let Some(view) = &recorded {
             let cloud = view.thinned(gaussians);
             let Pinhole { width, height, .. } = view.image.pinhole;
-            let scene = BenchScene::of_map(&gpu, &cloud, &view.world_from_camera, &view.image).into_diagnostic()?;
+            let camera = ViewCamera { pinhole: view.image.pinhole, camera_from_world: view.world_from_camera.inverse() };
+            let depth = view.image.depth.as_ref().map(|depth| depth.metres.as_slice());
+            let scene = BenchScene::of_map(&gpu, &cloud, camera, (&view.image.color, depth)).into_diagnostic()?;
             let sh_degree = cloud.sh_degree;
             measure(scene, StepBench { gaussians: cloud.len(), width, height, sh_degree, form, steps: args.steps })?;
             continue;
