@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use crate::mapping::MappingConfig;
-use crate::sequence::Layout;
+use crate::sequence::{Layout, SensorKind};
 use crate::tracking::TrackingConfig;
 
 /// Everything that a run can be told. Written resolved beside its outputs, where it is a valid configuration again.
@@ -33,6 +33,9 @@ pub struct SequenceConfig {
     /// Recognised where absent.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub layout: Option<Layout>,
+    /// Replay what a sensor of this kind would have given.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub sensor: Option<SensorKind>,
     /// A camera preset instead of what the recording says.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub camera: Option<String>,
@@ -135,7 +138,7 @@ mod tests {
     #[test]
     fn the_resolved_configuration_reads_back_the_same() {
         let mut config = Config { adapter: Some("llvmpipe".into()), ..Config::default() };
-        config.sequence = Some(SequenceConfig { path: "kitchen".into(), layout: Some(Layout::Tum), camera: None });
+        config.sequence = Some(SequenceConfig { path: "kitchen".into(), layout: Some(Layout::Tum), sensor: None, camera: None });
         config.replay.frames = Some((3, 9));
         assert_eq!(toml::from_str::<Config>(&config.to_toml()).unwrap(), config);
     }

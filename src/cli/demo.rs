@@ -34,7 +34,12 @@ pub fn demo(args: &DemoArgs, verbosity: Verbosity) -> miette::Result<()> {
         generate::render(&scene, &recording, verbosity)?;
         std::fs::write(recording.join(DIGEST_FILE), scene.digest()).into_diagnostic()?;
     }
-    let sequence = Some(SequenceConfig { path: std::path::absolute(recording).into_diagnostic()?, layout: None, camera: None });
+    let sequence = Some(SequenceConfig {
+        path: std::path::absolute(recording).into_diagnostic()?,
+        layout: None,
+        sensor: None,
+        camera: None,
+    });
     let config = Config { sequence, map_scale: MAP_SCALE, ..Config::default() };
     let stop = Arc::new(AtomicBool::new(false));
     progress::stop_on_ctrl_c(&stop)?;

@@ -5,7 +5,6 @@ use std::path::PathBuf;
 
 use clap::Args;
 use keysplat::config::{Config, SequenceConfig};
-use keysplat::evaluation::metrics::SensorKind;
 use keysplat::evaluation::trajectory::MAX_TIME_DIFFERENCE_S;
 use keysplat::evaluation::{Metrics, sha256_hex, write_json};
 use keysplat::export::MapFormat;
@@ -85,8 +84,8 @@ fn resolve(args: &EvalArgs) -> miette::Result<Config> {
     let own = args.dir.join(outputs::CONFIG);
     let mut config = if own.is_file() { Config::read(&own).into_diagnostic()? } else { Config::default() };
     if let Some(path) = &args.sequence {
-        let (layout, camera) = config.sequence.take().map_or((None, None), |s| (s.layout, s.camera));
-        config.sequence = Some(SequenceConfig { path: path.clone(), layout, camera });
+        let (layout, sensor, camera) = config.sequence.take().map_or((None, None, None), |s| (s.layout, s.sensor, s.camera));
+        config.sequence = Some(SequenceConfig { path: path.clone(), layout, sensor, camera });
     }
     config.map_scale = args.map_scale.unwrap_or(config.map_scale);
     config.adapter = args.adapter.clone().or(config.adapter);
@@ -126,7 +125,7 @@ fn earlier_metrics(args: &EvalArgs) -> miette::Result<Option<Metrics>> {
 fn foreign_metrics(sequence: &Sequence, config: &Config) -> Metrics {
     Metrics {
         sequence: sequence.name.clone(),
-        sensor: SensorKind::Rgbd,
+        sensor: sequence.sensor.kind(),
         paced: config.replay.paced,
         frames: sequence.entries.len() as u64,
         frames_read_failed: 0,

@@ -10,7 +10,7 @@ use indicatif::ProgressBar;
 use keysplat::config::{Config, SequenceConfig};
 use keysplat::gpu::Gpu;
 use keysplat::pipeline::{self, Outcome, PipelineError, Progress, outputs};
-use keysplat::sequence::{Layout, Sequence};
+use keysplat::sequence::{Layout, SensorKind, Sequence};
 use miette::{IntoDiagnostic, miette};
 
 use super::{Verbosity, print_metrics, progress};
@@ -28,6 +28,9 @@ pub struct RunArgs {
     /// Layout of the recording, where it isn't recognised.
     #[arg(long, value_enum)]
     layout: Option<Layout>,
+    /// Use of the recording only what a sensor of this kind gives.
+    #[arg(long, value_enum)]
+    sensor: Option<SensorKind>,
     /// Camera preset to use instead of the recording's own calibration.
     #[arg(long)]
     camera: Option<String>,
@@ -62,13 +65,14 @@ impl RunArgs {
         if let Some(path) = &self.sequence {
             // Absolute, so that the written configuration finds it from anywhere.
             let path = std::path::absolute(path).into_diagnostic()?;
-            config.sequence = Some(SequenceConfig { path, layout: None, camera: None });
+            config.sequence = Some(SequenceConfig { path, layout: None, sensor: None, camera: None });
         }
         let sequence = config
             .sequence
             .as_mut()
             .ok_or_else(|| miette!("which recording? Give its folder: keysplat run <SEQUENCE> --out <DIR>"))?;
         sequence.layout = self.layout.or(sequence.layout);
+        sequence.sensor = self.sensor.or(sequence.sensor);
         sequence.camera = self.camera.clone().or(sequence.camera.take());
         config.map_scale = self.map_scale.unwrap_or(config.map_scale);
         config.replay.every = self.every.unwrap_or(config.replay.every);
@@ -92,6 +96,9 @@ pub fn run(args: RunArgs, verbosity: Verbosity) -> miette::Result<()> {
 pub fn open(config: &mut Config) -> miette::Result<Sequence> {
     let named = config.sequence.as_ref().ok_or_else(|| miette!("the configuration names no recording"))?;
     let mut sequence = Sequence::open(&named.path, named.layout, named.camera.as_deref()).into_diagnostic()?;
+    if let Some(kind) = named.sensor {
+        sequence.restrict_to(kind).into_diagnostic()?;
+    }
     let recorded = sequence.entries.len();
     let range = config.replay.frames.map(|(start, end)| start..end);
     sequence.select(range, config.replay.every).into_diagnostic()?;

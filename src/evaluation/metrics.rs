@@ -6,6 +6,7 @@
 use std::fmt;
 use std::path::Path;
 
+use crate::sequence::SensorKind;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
@@ -47,14 +48,6 @@ pub struct Metrics {
     pub version: String,
     /// SHA-256 of the resolved configuration's text.
     pub config_hash: Option<String>,
-}
-
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum SensorKind {
-    Rgbd,
-    Mono,
-    Stereo,
 }
 
 /// Absolute trajectory error, each aligned over its own poses.

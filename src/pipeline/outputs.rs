@@ -8,13 +8,13 @@ use image::{GenericImage, RgbImage};
 
 use super::Outcome;
 use crate::config::Config;
-use crate::evaluation::metrics::{Adapter, AteFigures, MappingFigures, Metrics, RpeFigures, SensorKind, Times, UsualTimes};
+use crate::evaluation::metrics::{Adapter, AteFigures, MappingFigures, Metrics, RpeFigures, Times, UsualTimes};
 use crate::evaluation::views::{ComparedView, ViewSelection, evaluate_views};
 use crate::evaluation::{Alignment, evaluate_trajectory, machine, sha256_hex, write_json};
 use crate::export::{ExportError, MapFormat, write_atomically};
 use crate::geometry::{Se3, Trajectory};
 use crate::gpu::{Gpu, GpuError};
-use crate::sequence::Sequence;
+use crate::sequence::{SensorKind, Sequence};
 use crate::splat::GaussianCloud;
 
 /// Names in the run's folder.
@@ -113,7 +113,9 @@ pub fn measure(
 ) -> Result<Measured, OutputError> {
     remove_pictures(out)?;
     let truth = sequence.groundtruth.as_ref();
-    let errors = |estimate: &Trajectory| truth.and_then(|truth| evaluate_trajectory(truth, estimate, Alignment::Rigid).ok());
+    // One camera alone cannot know the scale.
+    let alignment = if sequence.sensor.kind() == SensorKind::Mono { Alignment::Similarity } else { Alignment::Rigid };
+    let errors = |estimate: &Trajectory| truth.and_then(|truth| evaluate_trajectory(truth, estimate, alignment).ok());
     let (all, keyframes) = (errors(subject.trajectory), errors(&subject.keyframes));
     let is_held_out = |index: usize| config.replay.is_held_out(index);
     let held_out = subject.poses.iter().filter(|(index, _)| is_held_out(*index)).count();
@@ -170,7 +172,7 @@ pub fn write_metrics(
     let pinhole = sequence.camera.pinhole.scaled(config.map_scale);
     let metrics = Metrics {
         sequence: sequence.name.clone(),
-        sensor: SensorKind::Rgbd,
+        sensor: sequence.sensor.kind(),
         paced: config.replay.paced,
         frames,
         frames_read_failed: outcome.frames_read_failed as u64,

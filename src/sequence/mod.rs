@@ -3,13 +3,14 @@
 //! Adding a layout takes one file and one row in [`Layout`].
 
 mod cameras;
+mod kitti;
 mod rectify;
 pub mod synthetic;
 mod tum;
 
 use std::path::{Path, PathBuf};
 
-use image::RgbImage;
+use image::{GrayImage, RgbImage};
 use serde::{Deserialize, Serialize};
 
 use crate::geometry::{Camera, Trajectory, TrajectoryError};
@@ -22,15 +23,18 @@ pub use rectify::{RectifiedImage, Rectifier};
 pub enum Layout {
     /// `rgb.txt`, `depth.txt`, `groundtruth.txt`, and `camera.txt` or a folder name that says which TUM camera it was.
     Tum,
+    /// `image_0` and `image_1` (or `image_2` and `image_3`), `calib.txt`, and perhaps `times.txt` and `poses.txt`.
+    Kitti,
 }
 
 impl Layout {
-    pub const ALL: [Self; 1] = [Self::Tum];
+    pub const ALL: [Self; 2] = [Self::Tum, Self::Kitti];
 
     /// The layouts with their marker files, for messages.
     fn known() -> String {
         let of = |layout: Self| match layout {
             Self::Tum => "tum: has rgb.txt",
+            Self::Kitti => "kitti: has calib.txt and image_0",
         };
         Self::ALL.map(of).join(", ")
     }
@@ -39,7 +43,48 @@ impl Layout {
     fn recognise(folder: &Path) -> Option<Self> {
         Self::ALL.into_iter().find(|layout| match layout {
             Self::Tum => folder.join("rgb.txt").is_file(),
+            Self::Kitti => kitti::recognise(folder),
         })
+    }
+}
+
+/// What a recording's frames hold.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Sensor {
+    /// Colour and registered depth.
+    Rgbd,
+    /// Row-aligned pairs without distortion; the right camera is `baseline_metres` along the left one's x axis.
+    Stereo { baseline_metres: f64 },
+    /// Colour alone; lengths have no scale.
+    Mono,
+}
+
+/// The same without its measures.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "lowercase")]
+pub enum SensorKind {
+    Rgbd,
+    Mono,
+    Stereo,
+}
+
+impl std::fmt::Display for SensorKind {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Self::Rgbd => "rgbd",
+            Self::Mono => "mono",
+            Self::Stereo => "stereo",
+        })
+    }
+}
+
+impl Sensor {
+    pub fn kind(self) -> SensorKind {
+        match self {
+            Self::Rgbd => SensorKind::Rgbd,
+            Self::Stereo { .. } => SensorKind::Stereo,
+            Self::Mono => SensorKind::Mono,
+        }
     }
 }
 
@@ -69,6 +114,8 @@ pub struct Frame {
     pub color: RgbImage,
     /// Registered to `color`, same size.
     pub depth: Option<DepthImage>,
+    /// The right camera's image, same size, row-aligned with `color`.
+    pub right: Option<GrayImage>,
 }
 
 /// Where one frame lies on disk.
@@ -77,6 +124,8 @@ pub struct FrameEntry {
     pub timestamp_s: f64,
     pub color: PathBuf,
     pub depth: Option<PathBuf>,
+    /// The right image of a stereo pair.
+    pub right: Option<PathBuf>,
 }
 
 /// A recording, opened and checked: its camera, the list of its frames, and the truth where there is one.
@@ -85,6 +134,7 @@ pub struct Sequence {
     pub name: String,
     pub layout: Layout,
     pub camera: Camera,
+    pub sensor: Sensor,
     pub entries: Vec<FrameEntry>,
     pub groundtruth: Option<Trajectory>,
 }
@@ -95,6 +145,8 @@ pub enum SequenceError {
     Missing(PathBuf),
     #[error("{0} is no recording in a layout that we know ({known}); check the folder, or name its layout with --layout", known = Layout::known())]
     UnknownLayout(PathBuf),
+    #[error("{name} is a {found} recording and cannot be replayed as {wanted}; leave --sensor out, or say mono")]
+    NoSuchSensor { name: String, wanted: SensorKind, found: SensorKind },
     #[error("cannot read {path}: {source}")]
     Read { path: PathBuf, source: std::io::Error },
     #[error("{path}:{line}: {what}")]
@@ -129,7 +181,23 @@ impl Sequence {
         let layout = layout.or_else(|| Layout::recognise(folder)).ok_or_else(|| SequenceError::UnknownLayout(folder.into()))?;
         match layout {
             Layout::Tum => tum::open(folder, camera),
+            Layout::Kitti => kitti::open(folder),
         }
+    }
+
+    /// Takes from the recording only what a sensor of this kind gives: a monocular replay of an RGB-D recording leaves its depth out.
+    pub fn restrict_to(&mut self, kind: SensorKind) -> Result<(), SequenceError> {
+        if kind == self.sensor.kind() {
+            return Ok(());
+        }
+        if kind != SensorKind::Mono {
+            return Err(SequenceError::NoSuchSensor { name: self.name.clone(), wanted: kind, found: self.sensor.kind() });
+        }
+        self.sensor = Sensor::Mono;
+        for entry in &mut self.entries {
+            (entry.depth, entry.right) = (None, None);
+        }
+        Ok(())
     }
 
     /// Keeps frames `start..end` (the end clipped to the sequence), then every `every`-th of these.
@@ -150,7 +218,14 @@ impl Sequence {
         let color = decode(&entry.color)?.into_rgb8();
         self.check_size(&entry.color, color.dimensions())?;
         let depth = entry.depth.as_deref().map(|path| self.load_depth(path)).transpose()?;
-        Ok(Frame { index, timestamp_s: entry.timestamp_s, color, depth })
+        let right = entry.right.as_deref().map(|path| self.load_right(path)).transpose()?;
+        Ok(Frame { index, timestamp_s: entry.timestamp_s, color, depth, right })
+    }
+
+    fn load_right(&self, path: &Path) -> Result<GrayImage, SequenceError> {
+        let image = decode(path)?.into_luma8();
+        self.check_size(path, image.dimensions())?;
+        Ok(image)
     }
 
     fn load_depth(&self, path: &Path) -> Result<DepthImage, SequenceError> {
@@ -175,6 +250,28 @@ impl Sequence {
             Err(SequenceError::Size { path: path.into(), width, height, found_width, found_height })
         }
     }
+}
+
+/// The folder's own name, also of `.`.
+fn folder_name(folder: &Path) -> String {
+    let name = folder.canonicalize().ok().and_then(|p| p.file_name().map(|n| n.to_string_lossy().into_owned()));
+    name.unwrap_or_else(|| "sequence".into())
+}
+
+fn read_text(path: &Path) -> Result<String, SequenceError> {
+    std::fs::read_to_string(path).map_err(|source| SequenceError::Read { path: path.into(), source })
+}
+
+/// The pictures in a folder, by name.
+fn images_in(folder: &Path) -> Result<Vec<PathBuf>, SequenceError> {
+    let is_picture = |path: &PathBuf| {
+        let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
+        extension.is_some_and(|e| ["png", "jpg", "jpeg"].contains(&e.as_str()))
+    };
+    let entries = std::fs::read_dir(folder).map_err(|source| SequenceError::Read { path: folder.into(), source })?;
+    let mut images: Vec<PathBuf> = entries.filter_map(|e| Some(e.ok()?.path())).filter(is_picture).collect();
+    images.sort();
+    Ok(images)
 }
 
 fn decode(path: &Path) -> Result<image::DynamicImage, SequenceError> {

@@ -116,7 +116,7 @@ mod tests {
     fn frame(depth: impl Fn(u32, u32) -> f32) -> Frame {
         let metres = (0..64 * 48).map(|i| depth(i % 64, i / 64)).collect();
         let color = RgbImage::from_fn(64, 48, |x, y| Rgb([x as u8 * 2, y as u8 * 2, 7]));
-        Frame { index: 0, timestamp_s: 0.0, color, depth: Some(DepthImage { width: 64, height: 48, metres }) }
+        Frame { index: 0, timestamp_s: 0.0, color, depth: Some(DepthImage { width: 64, height: 48, metres }), right: None }
     }
 
     #[test]

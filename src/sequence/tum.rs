@@ -5,7 +5,7 @@
 
 use std::path::{Path, PathBuf};
 
-use super::{FrameEntry, Layout, Sequence, SequenceError, cameras};
+use super::{FrameEntry, Layout, Sensor, Sequence, SequenceError, cameras, folder_name};
 use crate::geometry::{Camera, Distortion, Pinhole, Trajectory};
 
 /// Colour and depth further apart than this do not belong together (half a frame at 30 Hz, rounded up as the benchmark's tools do).
@@ -17,8 +17,7 @@ struct ListedImage {
 }
 
 pub(super) fn open(folder: &Path, camera: Option<&str>) -> Result<Sequence, SequenceError> {
-    let folder_name = folder.canonicalize().ok().and_then(|p| p.file_name().map(|n| n.to_string_lossy().into_owned()));
-    let name = folder_name.unwrap_or_else(|| "sequence".into());
+    let name = folder_name(folder);
     let camera = match camera {
         Some(preset) => cameras::by_name(preset)?,
         None if folder.join("camera.txt").is_file() => read_camera(&folder.join("camera.txt"))?,
@@ -28,9 +27,10 @@ pub(super) fn open(folder: &Path, camera: Option<&str>) -> Result<Sequence, Sequ
     let depth_list = folder.join("depth.txt");
     let depths = if depth_list.is_file() { read_list(folder, "depth.txt")? } else { Vec::new() };
     let entries: Vec<FrameEntry> = pair(colors, &depths);
+    let sensor = if entries.iter().any(|entry| entry.depth.is_some()) { Sensor::Rgbd } else { Sensor::Mono };
     let groundtruth = folder.join("groundtruth.txt");
     let groundtruth = groundtruth.is_file().then(|| Trajectory::read_tum(&groundtruth)).transpose()?;
-    let sequence = Sequence { name, layout: Layout::Tum, camera, entries, groundtruth };
+    let sequence = Sequence { name, layout: Layout::Tum, camera, sensor, entries, groundtruth };
     for path in [Some(&sequence.entries[0].color), sequence.entries[0].depth.as_ref()].into_iter().flatten() {
         // A first frame that cannot be read at all is met again, and counted, when it is loaded.
         if let Ok(size) = image::image_dimensions(path) {
@@ -55,6 +55,7 @@ fn pair(colors: Vec<ListedImage>, depths: &[ListedImage]) -> Vec<FrameEntry> {
             timestamp_s: color.timestamp_s,
             depth: nearest(color.timestamp_s).map(|d| d.path.clone()),
             color: color.path,
+            right: None,
         })
         .collect()
 }
