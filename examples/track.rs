@@ -19,7 +19,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let config: TrackingConfig = toml::from_str(&settings.iter().filter(own).cloned().collect::<Vec<_>>().join("\n"))?;
     let mut sequence = Sequence::open(Path::new(folder), None, None)?;
     sequence.select(None, every)?;
-    let mut tracker = Tracker::new(sequence.camera, &config)?;
+    let mut tracker = Tracker::new(sequence.camera, sequence.sensor, &config)?;
     let (mut times, mut lost, mut inliers) = (Vec::<StageTimes>::new(), Vec::new(), Vec::new());
     let mut shared = Vec::new();
     for index in 0..sequence.entries.len() {

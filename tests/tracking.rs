@@ -4,7 +4,8 @@ use std::path::Path;
 
 use image::{Rgb, RgbImage};
 use keysplat::geometry::{Camera, Distortion, Pinhole, Se3, se3};
-use keysplat::sequence::{DepthImage, Frame, Sequence};
+
+use keysplat::sequence::{DepthImage, Frame, Sensor, Sequence};
 use keysplat::tracking::{TrackedFrame, Tracker, TrackingConfig, TrackingState};
 use nalgebra::{Point3, Vector2, Vector3, Vector6};
 
@@ -55,7 +56,7 @@ fn render(index: usize, world_from_camera: &Se3) -> Frame {
         .map(|i| wall(&centre, &ray(f64::from(i % pinhole.width), f64::from(i / pinhole.width))) as f32)
         .collect();
     let depth = Some(DepthImage { width: pinhole.width, height: pinhole.height, metres });
-    Frame { index, timestamp_s: index as f64 / 30.0, color, depth }
+    Frame { index, timestamp_s: index as f64 / 30.0, color, depth, right: None }
 }
 
 /// A smooth walk through the room.
@@ -69,7 +70,7 @@ fn config() -> TrackingConfig {
 }
 
 fn tracker() -> Tracker {
-    Tracker::new(CAMERA, &config()).unwrap()
+    Tracker::new(CAMERA, Sensor::Rgbd, &config()).unwrap()
 }
 
 /// Distance and angle between an estimate and the truth, both relative to the first frame.
@@ -187,7 +188,7 @@ fn depth_may_be_missing_or_wrong_but_not_at_the_start() {
 #[test]
 fn unusable_input_is_refused_in_words() {
     let bad = TrackingConfig { features: 0, ..Default::default() };
-    assert!(Tracker::new(CAMERA, &bad).unwrap_err().to_string().contains("tracking.features"));
+    assert!(Tracker::new(CAMERA, Sensor::Rgbd, &bad).unwrap_err().to_string().contains("tracking.features"));
     let mut small = render(0, &truth(0));
     small.color = RgbImage::new(32, 24);
     let refused = tracker().track(&small, true).unwrap_err().to_string();
@@ -210,7 +211,7 @@ fn the_start_of_redkitchen_is_tracked() {
         return;
     };
     let sequence = Sequence::open(&Path::new(&data).join("redkitchen"), None, None).unwrap();
-    let mut tracker = Tracker::new(sequence.camera, &TrackingConfig::default()).unwrap();
+    let mut tracker = Tracker::new(sequence.camera, sequence.sensor, &TrackingConfig::default()).unwrap();
     for index in 0..60 {
         let tracked = tracker.track(&sequence.load(index).unwrap(), index % 8 != 7).unwrap();
         assert_eq!(tracked.state, TrackingState::Tracking, "frame {index}");

@@ -67,7 +67,7 @@ pub(super) fn track(
     progress: &Progress,
 ) -> TrackSummary {
     let mut summary = TrackSummary::default();
-    let mut tracker = match Tracker::new(sequence.camera, &config.tracking) {
+    let mut tracker = match Tracker::new(sequence.camera, sequence.sensor, &config.tracking) {
         Ok(tracker) => tracker,
         Err(error) => return TrackSummary { error: Some(error.into()), ..summary },
     };

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-/// Settings of the RGB-D tracker.
+/// Settings of the tracker.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TrackingConfig {
@@ -25,6 +25,8 @@ pub struct TrackingConfig {
     /// Standard deviation of measured inverse depth, 1/metres. A structured-light sensor measures disparity with constant noise,
     /// so its depth noise grows as `inverse_depth_sigma * depth²`.
     pub inverse_depth_sigma: f64,
+    /// Standard deviation of a stereo disparity at the finest pyramid level, pixels. Coarser levels scale it.
+    pub disparity_sigma: f64,
     /// A depth whose 3x3 neighbourhood spans more than this share of it lies on an edge and is not believed.
     pub depth_edge_ratio: f64,
     /// Landmarks that the first frame must give before there is a map.
@@ -58,6 +60,7 @@ impl Default for TrackingConfig {
             max_depth_metres: 6.0,
             pixel_sigma: 1.0,
             inverse_depth_sigma: 0.025,
+            disparity_sigma: 1.0,
             depth_edge_ratio: 0.05,
             min_initial_landmarks: 50,
             min_inliers: 20,
@@ -92,6 +95,7 @@ impl TrackingConfig {
         number("max_depth_metres", self.max_depth_metres, self.min_depth_metres, 1e4)?;
         number("pixel_sigma", self.pixel_sigma, 0.0, 100.0)?;
         number("inverse_depth_sigma", self.inverse_depth_sigma, 0.0, 100.0)?;
+        number("disparity_sigma", self.disparity_sigma, 0.0, 100.0)?;
         number("depth_edge_ratio", self.depth_edge_ratio, 0.0, 100.0)?;
         count("min_initial_landmarks", self.min_initial_landmarks, 10, self.features)?;
         count("min_inliers", self.min_inliers, 6, self.features)?;

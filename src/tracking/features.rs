@@ -33,6 +33,28 @@ pub struct Keypoint {
     pub descriptor: Descriptor,
 }
 
+/// An image at falling sizes, finest first.
+#[derive(Clone, Debug)]
+pub struct Pyramid {
+    levels: Vec<Mat>,
+}
+
+/// One level of a pyramid.
+#[derive(Clone, Copy, Debug)]
+pub struct LevelImage<'a> {
+    /// Row-major `[height * width]`.
+    pub pixels: &'a [u8],
+    pub width: usize,
+    pub height: usize,
+}
+
+impl Pyramid {
+    pub fn level(&self, octave: u8) -> Result<LevelImage<'_>, TrackingError> {
+        let image = &self.levels[usize::from(octave)];
+        Ok(LevelImage { pixels: image.data_bytes()?, width: image.cols() as usize, height: image.rows() as usize })
+    }
+}
+
 /// The extractor with its level sizes worked out.
 #[derive(Clone, Debug)]
 pub struct Extractor {
@@ -71,18 +93,23 @@ impl Extractor {
         }
     }
 
-    /// Keypoints of a grey image (row-major, the size this was made for), level by level.
-    pub fn extract(&self, grey: &[u8]) -> Result<Vec<Keypoint>, TrackingError> {
-        let Some(first) = self.levels.first() else { return Ok(Vec::new()) };
+    /// The pyramid of a grey image (row-major, the size this was made for); without levels where it is too small for any feature.
+    pub fn pyramid(&self, grey: &[u8]) -> Result<Pyramid, TrackingError> {
+        let Some(first) = self.levels.first() else { return Ok(Pyramid { levels: Vec::new() }) };
         let base = Mat::new_rows_cols_with_data(first.size.height, first.size.width, grey)?;
-        let mut pyramid: Vec<Mat> = vec![base.try_clone()?];
+        let mut levels: Vec<Mat> = vec![base.try_clone()?];
         for level in &self.levels[1..] {
             let mut smaller = Mat::default();
-            imgproc::resize(&pyramid[pyramid.len() - 1], &mut smaller, level.size, 0.0, 0.0, imgproc::INTER_LINEAR)?;
-            pyramid.push(smaller);
+            imgproc::resize(&levels[levels.len() - 1], &mut smaller, level.size, 0.0, 0.0, imgproc::INTER_LINEAR)?;
+            levels.push(smaller);
         }
+        Ok(Pyramid { levels })
+    }
+
+    /// Keypoints of a pyramid, level by level.
+    pub fn extract(&self, pyramid: &Pyramid) -> Result<Vec<Keypoint>, TrackingError> {
         let per_level: Vec<Result<Vec<Keypoint>, TrackingError>> =
-            pyramid.par_iter().enumerate().map(|(octave, image)| self.extract_level(image, octave)).collect();
+            pyramid.levels.par_iter().enumerate().map(|(octave, image)| self.extract_level(image, octave)).collect();
         let mut keypoints = Vec::new();
         for level in per_level {
             keypoints.extend(level?);
@@ -210,9 +237,13 @@ mod tests {
         dots.iter().enumerate().map(|(i, v)| (20.0 + v.min(200.0) * contrast(i)) as u8).collect()
     }
 
+    fn extract(extractor: &Extractor, grey: &[u8]) -> Vec<Keypoint> {
+        extractor.extract(&extractor.pyramid(grey).unwrap()).unwrap()
+    }
+
     #[test]
     fn features_cover_textured_and_faint_halves() {
-        let keypoints = Extractor::new(320, 240, &config()).extract(&picture()).unwrap();
+        let keypoints = extract(&Extractor::new(320, 240, &config()), &picture());
         let left = keypoints.iter().filter(|k| k.pixel.x < 160.0).count();
         assert!((300..=600).contains(&keypoints.len()), "{} features", keypoints.len());
         assert!(left > 100 && keypoints.len() - left > 100, "{left} of {} are on the left", keypoints.len());
@@ -224,7 +255,7 @@ mod tests {
         let picture = picture();
         let turned: Vec<u8> = picture.iter().rev().copied().collect();
         let extractor = Extractor::new(320, 240, &config());
-        let (a, b) = (extractor.extract(&picture).unwrap(), extractor.extract(&turned).unwrap());
+        let (a, b) = (extract(&extractor, &picture), extract(&extractor, &turned));
         let mut same = 0;
         for k in a.iter().filter(|k| k.octave == 0) {
             let there = Vector2::new(319.0, 239.0) - k.pixel;
@@ -238,7 +269,7 @@ mod tests {
 
     #[test]
     fn blank_pictures_have_no_features() {
-        assert!(Extractor::new(320, 240, &config()).extract(&vec![0; 320 * 240]).unwrap().is_empty());
-        assert!(Extractor::new(16, 16, &config()).extract(&[0; 256]).unwrap().is_empty());
+        assert!(extract(&Extractor::new(320, 240, &config()), &vec![0; 320 * 240]).is_empty());
+        assert!(extract(&Extractor::new(16, 16, &config()), &[0; 256]).is_empty());
     }
 }

@@ -3,14 +3,17 @@
 use nalgebra::{Point3, Vector2};
 
 use super::descriptor::Descriptor;
-use super::features::Extractor;
+use super::features::{Extractor, Keypoint};
 use super::measurement::Measurement;
+use super::stereo::{Eye, disparities};
 use super::{TrackingConfig, TrackingError};
 use crate::geometry::{Camera, Pinhole};
-use crate::sequence::{DepthImage, Frame};
+use crate::sequence::{DepthImage, Frame, Sensor};
 
 /// Side of the search grid's cells, pixels.
 const CELL_PIXELS: f64 = 16.0;
+/// Relative standard deviation of depth up to which a measurement makes a point.
+const MAX_DEPTH_ERROR: f64 = 0.08;
 /// Size of the thumbnail by which places are recognised.
 const THUMBNAIL: (usize, usize) = (40, 30);
 
@@ -21,8 +24,10 @@ pub struct Feature {
     pub pixel: Vector2<f64>,
     pub octave: u8,
     pub angle_rad: f32,
-    /// Metres along z, where the sensor's depth is believed.
+    /// Metres along z, where it was measured and is believed.
     pub depth_metres: Option<f64>,
+    /// Standard deviation of the measured inverse depth, 1/metres.
+    pub inverse_depth_sigma: f64,
     pub descriptor: Descriptor,
 }
 
@@ -58,22 +63,34 @@ impl FrameFeatures {
         Self { features, thumbnail, columns, rows, cells, order }
     }
 
-    /// Extracts the features of a frame and looks up their depths.
+    /// Extracts the features of a frame and finds their depths, from the depth image or from the right eye.
     pub fn of_frame(
         frame: &Frame,
-        camera: &Camera,
+        (camera, sensor): (&Camera, Sensor),
         extractor: &Extractor,
         config: &TrackingConfig,
     ) -> Result<Self, TrackingError> {
         let grey: Vec<u8> = frame.color.pixels().map(|p| luma(p.0)).collect();
-        let features = extractor
-            .extract(&grey)?
+        let (keypoints, depths) = match (sensor, &frame.right) {
+            (Sensor::Stereo { baseline_metres }, Some(right)) => {
+                stereo_depths(&grey, right.as_raw(), camera.pinhole.fx * baseline_metres, camera.pinhole.fx, (extractor, config))?
+            }
+            _ => {
+                let keypoints = extractor.extract(&extractor.pyramid(&grey)?)?;
+                let depth = |k: &Keypoint| believed_depth(frame.depth.as_ref()?, &k.pixel, config);
+                let depths = keypoints.iter().map(|k| Some((depth(k)?, config.inverse_depth_sigma))).collect();
+                (keypoints, depths)
+            }
+        };
+        let features = keypoints
             .into_iter()
-            .map(|k| Feature {
+            .zip(depths)
+            .map(|(k, depth)| Feature {
                 pixel: camera.undistort_pixel(&k.pixel),
                 octave: k.octave,
                 angle_rad: k.angle_rad,
-                depth_metres: frame.depth.as_ref().and_then(|d| believed_depth(d, &k.pixel, config)),
+                depth_metres: depth.map(|(metres, _)| metres),
+                inverse_depth_sigma: depth.map_or(0.0, |(_, sigma)| sigma),
                 descriptor: k.descriptor,
             })
             .filter(|f| f.pixel.iter().all(|v| v.is_finite()))
@@ -99,10 +116,11 @@ impl FrameFeatures {
         }
     }
 
-    /// The feature's point in the camera frame; `None` without depth.
+    /// The feature's point in the camera frame; `None` without a depth that is certain enough to make a point of.
     pub fn point_in_camera(&self, index: usize, pinhole: &Pinhole) -> Option<Point3<f64>> {
         let feature = &self.features[index];
-        feature.depth_metres.map(|depth| Point3::from(pinhole.unproject(&feature.pixel, depth)))
+        let depth = feature.depth_metres.filter(|depth| depth * feature.inverse_depth_sigma < MAX_DEPTH_ERROR)?;
+        Some(Point3::from(pinhole.unproject(&feature.pixel, depth)))
     }
 
     /// Median of the believed depths, metres.
@@ -120,9 +138,31 @@ impl Feature {
             pixel: self.pixel,
             inverse_depth: self.depth_metres.map(|d| 1.0 / d),
             pixel_weight: 1.0 / (config.pixel_sigma * config.pyramid_scale.powi(self.octave.into())),
-            depth_weight: 1.0 / config.inverse_depth_sigma,
+            depth_weight: if self.depth_metres.is_some() { 1.0 / self.inverse_depth_sigma } else { 0.0 },
         }
     }
+}
+
+/// Keypoints of the left image, and their `(depth, standard deviation of the inverse depth)` from the right one. `scale` is the product
+/// of focal length and baseline: depth = scale / disparity.
+fn stereo_depths(
+    left: &[u8],
+    right: &[u8],
+    scale: f64,
+    max_disparity: f64,
+    (extractor, config): (&Extractor, &TrackingConfig),
+) -> Result<(Vec<Keypoint>, Vec<Option<(f64, f64)>>), TrackingError> {
+    let eye = |grey| -> Result<_, TrackingError> {
+        let pyramid = extractor.pyramid(grey)?;
+        Ok((extractor.extract(&pyramid)?, pyramid))
+    };
+    let (left, right) = rayon::join(|| eye(left), || eye(right));
+    let ((keypoints, left), (others, right)) = (left?, right?);
+    let eyes = (Eye { keypoints: &keypoints, pyramid: &left }, Eye { keypoints: &others, pyramid: &right });
+    let disparities = disparities(eyes.0, eyes.1, max_disparity, config.pyramid_scale)?;
+    let sigma = |k: &Keypoint| config.disparity_sigma * config.pyramid_scale.powi(k.octave.into()) / scale;
+    let depths = keypoints.iter().zip(disparities).map(|(k, disparity)| disparity.map(|d| (scale / d, sigma(k)))).collect();
+    Ok((keypoints, depths))
 }
 
 /// The grid line (row or column) of a coordinate; what lies outside belongs to the border.
@@ -183,7 +223,7 @@ pub(super) mod tests {
     use super::*;
 
     pub fn feature(x: f64, y: f64, descriptor: Descriptor) -> Feature {
-        Feature { pixel: Vector2::new(x, y), octave: 0, angle_rad: 0.0, depth_metres: None, descriptor }
+        Feature { pixel: Vector2::new(x, y), octave: 0, angle_rad: 0.0, depth_metres: None, inverse_depth_sigma: 0.0, descriptor }
     }
 
     #[test]

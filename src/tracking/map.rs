@@ -223,6 +223,15 @@ impl Map {
         ranked
     }
 
+    /// Median depth of the landmarks that a keyframe sees, metres.
+    pub fn median_depth(&self, keyframe: usize) -> Option<f64> {
+        let view = &self.keyframes[keyframe];
+        let depth = |l: &usize| (view.camera_from_world * self.landmarks[*l].position).z;
+        let mut depths: Vec<f64> = view.landmarks.iter().flatten().map(depth).collect();
+        depths.sort_by(f64::total_cmp);
+        depths.get(depths.len() / 2).copied()
+    }
+
     /// The landmarks of some keyframes, each once, in order of first mention.
     pub fn landmarks_of(&self, keyframes: &[usize]) -> Vec<usize> {
         let mut seen = vec![false; self.landmarks.len()];

@@ -20,7 +20,9 @@ mod measurement;
 mod pose;
 mod relocalise;
 mod spread;
+mod stereo;
 mod tracker;
+mod triangulate;
 mod window;
 
 pub use config::TrackingConfig;

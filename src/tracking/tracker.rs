@@ -10,9 +10,9 @@ use super::frame_features::FrameFeatures;
 use super::keyframe;
 use super::localise::{Context, Localised};
 use super::map::{Keyframe, Map};
-use super::{KeyframePose, NewKeyframe, StageTimes, TrackedFrame, TrackingConfig, TrackingError, TrackingState, mapping, window};
+use super::{KeyframePose, NewKeyframe, StageTimes, TrackedFrame, TrackingConfig, TrackingError, TrackingState, mapping, triangulate, window};
 use crate::geometry::{Camera, Se3, StampedPose};
-use crate::sequence::Frame;
+use crate::sequence::{Frame, Sensor};
 
 /// For this many frames after the camera was found again, poses are held to the stricter count.
 const FRESHLY_FOUND_FRAMES: usize = 5;
@@ -20,10 +20,11 @@ const FRESHLY_FOUND_FRAMES: usize = 5;
 /// A true pose agrees with well over half of its matches, one by chance with few.
 const MIN_INLIER_SHARE: f64 = 0.35;
 
-/// RGB-D tracker.
+/// The tracker, for any sensor.
 #[derive(Debug)]
 pub struct Tracker {
     camera: Camera,
+    sensor: Sensor,
     config: TrackingConfig,
     extractor: Extractor,
     map: Map,
@@ -62,10 +63,11 @@ impl Tracker {
     ///
     /// # Errors
     /// [`TrackingError::Config`] if a setting is out of its range.
-    pub fn new(camera: Camera, config: &TrackingConfig) -> Result<Self, TrackingError> {
+    pub fn new(camera: Camera, sensor: Sensor, config: &TrackingConfig) -> Result<Self, TrackingError> {
         config.validate().map_err(TrackingError::Config)?;
         Ok(Self {
             camera,
+            sensor,
             config: config.clone(),
             extractor: Extractor::new(camera.pinhole.width, camera.pinhole.height, config),
             map: Map::default(),
@@ -89,7 +91,7 @@ impl Tracker {
         self.frames_seen += 1;
         let mut times = StageTimes::default();
         let clock = Instant::now();
-        let features = Arc::new(FrameFeatures::of_frame(frame, &self.camera, &self.extractor, &self.config)?);
+        let features = Arc::new(FrameFeatures::of_frame(frame, (&self.camera, self.sensor), &self.extractor, &self.config)?);
         times.features_ms = milliseconds(clock);
         let Some(last) = self.last.take() else {
             return Ok(self.start(frame, features, may_be_keyframe, times));
@@ -140,7 +142,7 @@ impl Tracker {
         size("colour", frame.color.dimensions())?;
         match &frame.depth {
             Some(depth) => size("depth", (depth.width, depth.height)),
-            None if self.frames_seen == 0 => Err(TrackingError::FirstFrameWithoutDepth { frame: frame.index }),
+            None if self.frames_seen == 0 && self.sensor == Sensor::Rgbd => Err(TrackingError::FirstFrameWithoutDepth { frame: frame.index }),
             None => Ok(()),
         }
     }
@@ -258,6 +260,7 @@ impl Tracker {
             landmarks: found.landmarks,
         };
         let id = mapping::insert_keyframe(&mut self.map, keyframe, pinhole, config);
+        triangulate::triangulate_with_neighbours(&mut self.map, id, pinhole, config);
         mapping::join_neighbours(&mut self.map, id, pinhole, config);
         mapping::remove_unproven(&mut self.map, id);
         times.mapping_ms = milliseconds(clock);
