@@ -1,13 +1,14 @@
 //! Tracks a recorded sequence and says how well: `track <sequence folder> [trajectory.txt] [key=value …]` prints frames tracked,
-//! keyframes, ATE RMSE after SE(3) alignment, and the time per frame by stage. `key=value` sets a field of the
-//! tracking config; `every=N` takes every N-th frame, `hold_out=N` lets no N-th frame become a keyframe.
+//! keyframes, ATE RMSE after alignment (with scale for one camera alone), and the time per frame by stage. `key=value` sets a field of the
+//! tracking config; `sensor=mono` leaves depth or the right eye out, `every=N` takes every N-th frame, `hold_out=N` lets no N-th frame become a keyframe.
 
 use std::error::Error;
 use std::path::Path;
 
 use keysplat::evaluation::{Alignment, evaluate_trajectory};
 use keysplat::geometry::Trajectory;
-use keysplat::sequence::Sequence;
+use clap::ValueEnum;
+use keysplat::sequence::{SensorKind, Sequence};
 use keysplat::tracking::{StageTimes, Tracker, TrackingConfig, TrackingState};
 
 fn main() -> Result<(), Box<dyn Error>> {
@@ -15,9 +16,13 @@ fn main() -> Result<(), Box<dyn Error>> {
     let folder = paths.first().ok_or("usage: track <sequence folder> [trajectory.txt] [key=value …]")?;
     let number = |key: &str| settings.iter().find_map(|s| s.strip_prefix(key)).map(str::parse::<usize>).transpose();
     let (every, hold_out) = (number("every=")?.unwrap_or(1), number("hold_out=")?.unwrap_or(usize::MAX));
-    let own = |s: &&String| !s.starts_with("every=") && !s.starts_with("hold_out=");
+    let own = |s: &&String| !s.starts_with("sensor=") && !s.starts_with("every=") && !s.starts_with("hold_out=");
     let config: TrackingConfig = toml::from_str(&settings.iter().filter(own).cloned().collect::<Vec<_>>().join("\n"))?;
     let mut sequence = Sequence::open(Path::new(folder), None, None)?;
+    if let Some(kind) = settings.iter().find_map(|s| s.strip_prefix("sensor=")) {
+        sequence.restrict_to(SensorKind::from_str(kind, true)?)?;
+    }
+    let sensor = sequence.sensor.kind();
     sequence.select(None, every)?;
     let mut tracker = Tracker::new(sequence.camera, sequence.sensor, &config)?;
     let (mut times, mut lost, mut inliers) = (Vec::<StageTimes>::new(), Vec::new(), Vec::new());
@@ -41,7 +46,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     shared.sort_unstable();
     println!("landmarks shared by neighbouring keyframes: median {}", shared[shared.len() / 2]);
     if let Some(truth) = &sequence.groundtruth {
-        print_errors(&trajectory, truth);
+        print_errors(&trajectory, truth, if sensor == SensorKind::Mono { Alignment::Similarity } else { Alignment::Rigid });
     }
     print_times(&times);
     if let Some(path) = paths.get(1) {
@@ -50,8 +55,8 @@ fn main() -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-fn print_errors(trajectory: &Trajectory, truth: &Trajectory) {
-    match evaluate_trajectory(truth, trajectory, Alignment::Rigid) {
+fn print_errors(trajectory: &Trajectory, truth: &Trajectory, alignment: Alignment) {
+    match evaluate_trajectory(truth, trajectory, alignment) {
         Ok(e) => println!(
             "ATE RMSE {:.3} cm over {} poses, median {:.2} cm, worst {:.2} cm",
             100.0 * e.ate_rmse_m,

@@ -60,7 +60,7 @@ impl Default for TrackingConfig {
             max_depth_metres: 6.0,
             pixel_sigma: 1.0,
             inverse_depth_sigma: 0.025,
-            disparity_sigma: 1.0,
+            disparity_sigma: 1.4,
             depth_edge_ratio: 0.05,
             min_initial_landmarks: 50,
             min_inliers: 20,

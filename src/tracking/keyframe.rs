@@ -24,7 +24,7 @@ pub fn is_due(map: &Map, frame: &FrameFeatures, found: &Localised, reference: us
     let overlap = found.inliers as f64 / expected.max(1) as f64;
 
     let camera_from_reference = found.camera_from_world * view.camera_from_world.inverse();
-    let depth = frame.median_depth().or_else(|| view.features.median_depth()).unwrap_or(1.0);
+    let depth = frame.median_depth().or_else(|| map.median_depth(reference)).unwrap_or(1.0);
     // 1 where the camera has moved or turned as far as a keyframe needs.
     let moved = camera_from_reference.translation.vector.norm() / (config.keyframe_translation * depth);
     let turned = camera_from_reference.rotation.angle() / config.keyframe_rotation_rad;

@@ -63,7 +63,7 @@ fn neighbours(map: &Map, keyframe: usize) -> Vec<usize> {
     let covisible = map.covisible(keyframe);
     let mut chosen: Vec<usize> = covisible.iter().take(JOINED_COVISIBLE).map(|(k, _)| *k).collect();
     let this = &map.keyframes[keyframe];
-    let reach = NEARBY_SHARE * this.features.median_depth().unwrap_or(1.0);
+    let reach = NEARBY_SHARE * this.features.median_depth().or_else(|| map.median_depth(keyframe)).unwrap_or(1.0);
     let mut nearby: Vec<(f64, usize)> = Vec::new();
     for (k, other) in map.keyframes.iter().enumerate() {
         let distance = (other.centre() - this.centre()).norm() / reach;

@@ -9,7 +9,7 @@ const MAX_DISTANCE: u32 = 75;
 /// Rows that a match may be off, pixels at its own level.
 const ROW_BAND: f64 = 2.0;
 /// Half the side of the patches that are compared, and how far they are shifted, pixels at the keypoint's level.
-const PATCH: i64 = 5;
+const PATCH: i64 = 10;
 const SHIFT: i64 = 5;
 /// Gauss-Newton steps of the sub-pixel alignment, and the variance of the gradient along the row that it needs, (grey levels/pixel)².
 const REFINEMENTS: usize = 6;

@@ -10,6 +10,7 @@ use super::frame_features::FrameFeatures;
 use super::keyframe;
 use super::localise::{Context, Localised};
 use super::map::{Keyframe, Map};
+use super::mono::{self, FirstView};
 use super::{KeyframePose, NewKeyframe, StageTimes, TrackedFrame, TrackingConfig, TrackingError, TrackingState, mapping, triangulate, window};
 use crate::geometry::{Camera, Se3, StampedPose};
 use crate::sequence::{Frame, Sensor};
@@ -30,6 +31,8 @@ pub struct Tracker {
     map: Map,
     /// The last frame with a pose; `None` before the map is started.
     last: Option<LastFrame>,
+    /// The frame that a map without depth may start from.
+    first_view: Option<FirstView>,
     /// camera_from_last_camera, as of the last two frames in a row.
     velocity: Option<Se3>,
     /// Keyframe that shares most landmarks with the last frame.
@@ -72,6 +75,7 @@ impl Tracker {
             extractor: Extractor::new(camera.pinhole.width, camera.pinhole.height, config),
             map: Map::default(),
             last: None,
+            first_view: None,
             velocity: None,
             reference: 0,
             lost: false,
@@ -94,7 +98,8 @@ impl Tracker {
         let features = Arc::new(FrameFeatures::of_frame(frame, (&self.camera, self.sensor), &self.extractor, &self.config)?);
         times.features_ms = milliseconds(clock);
         let Some(last) = self.last.take() else {
-            return Ok(self.start(frame, features, may_be_keyframe, times));
+            let start = if self.sensor == Sensor::Mono { Self::start_without_depth } else { Self::start };
+            return Ok(start(self, frame, features, may_be_keyframe, times));
         };
         let clock = Instant::now();
         let found = self.localise(&features, &last);
@@ -169,6 +174,48 @@ impl Tracker {
             world_from_camera: Some(Se3::identity()),
             inliers: with_depth,
             keyframe: Some(NewKeyframe { id, world_from_camera: Se3::identity(), covisible: Vec::new() }),
+            updates: Vec::new(),
+            times,
+        }
+    }
+
+    /// Starts the map with two frames that show one scene from two places.
+    fn start_without_depth(
+        &mut self,
+        frame: &Frame,
+        features: Arc<FrameFeatures>,
+        may: bool,
+        times: StageTimes,
+    ) -> TrackedFrame {
+        if !may {
+            return TrackedFrame::lost(times);
+        }
+        let (pinhole, config) = (&self.camera.pinhole, &self.config);
+        let matches = self.first_view.as_mut().and_then(|first| first.follow(&features, pinhole));
+        let (Some(first), Some(matches)) = (&self.first_view, matches) else {
+            self.first_view = Some(FirstView::new(frame.index, frame.timestamp_s, features));
+            return TrackedFrame::lost(times);
+        };
+        let this = (frame.index, frame.timestamp_s, &features);
+        let Some(map) = mono::first_map(first, this, &matches, pinhole, config) else { return TrackedFrame::lost(times) };
+        self.map = map;
+        self.first_view = None;
+        let keyframes = self.keyframes();
+        let [first, second] = &keyframes[..] else { return TrackedFrame::lost(times) };
+        for keyframe in [first, second] {
+            let (frame_index, timestamp_s, reference) = (keyframe.frame_index, keyframe.timestamp_s, keyframe.id);
+            self.records.push(Record { frame_index, timestamp_s, reference, camera_from_reference: Se3::identity() });
+        }
+        let (id, world_from_camera) = (second.id, second.world_from_camera);
+        self.reference = id;
+        let landmarks = self.map.keyframes[id].landmarks.clone();
+        let inliers = landmarks.iter().flatten().count();
+        self.last = Some(LastFrame { features, camera_from_world: world_from_camera.inverse(), landmarks });
+        TrackedFrame {
+            state: TrackingState::Tracking,
+            world_from_camera: Some(world_from_camera),
+            inliers,
+            keyframe: Some(NewKeyframe { id, world_from_camera, covisible: self.map.covisible(id) }),
             updates: Vec::new(),
             times,
         }
