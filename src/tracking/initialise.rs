@@ -25,8 +25,9 @@ const MIN_POINTS: usize = 50;
 const MIN_POINT_SHARE: f64 = 0.8;
 /// The second best motion must give less than this share of the best one's points.
 const CLEARLY: f64 = 0.75;
-/// Parallax that at least `MIN_POINTS` points must have, radians.
-const MIN_PARALLAX_RAD: f64 = 0.0175;
+/// Parallax that at least `MIN_POINTS` points must have, as pixels at the image's centre: well above what keypoints are off, or a turn
+/// passes for a translation.
+const MIN_PARALLAX_PIXELS: f64 = 17.0;
 /// Reprojection error of a good point, pixels.
 const MAX_ERROR_PIXELS: f64 = 2.0;
 
@@ -53,7 +54,7 @@ pub fn two_views(matches: &[(Vector2<f64>, Vector2<f64>)], pinhole: &Pinhole) ->
     let (count, parallax_rad, best) = tried.into_iter().next()?;
     let enough = count >= MIN_POINTS && count as f64 >= MIN_POINT_SHARE * inliers as f64;
     let clear = (second as f64) < CLEARLY * count as f64;
-    (enough && clear && parallax_rad >= MIN_PARALLAX_RAD).then_some(best)
+    (enough && clear && parallax_rad * pinhole.fx >= MIN_PARALLAX_PIXELS).then_some(best)
 }
 
 /// What one model of the two views allows.

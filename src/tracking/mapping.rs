@@ -19,7 +19,7 @@ const NEARBY_COSINE: f64 = 0.77;
 /// Search radius when joining, pixels at the finest level.
 const JOIN_RADIUS: f64 = 3.0;
 const JOIN_RULES: Rules = Rules { max_distance: 50, ratio: 1.0, check_rotation: false };
-/// A landmark is on probation for this many keyframes, and must then be seen by two.
+/// A landmark is on probation for this many keyframes, and must then be seen by two; by three if it was triangulated from two.
 const PROBATION: usize = 3;
 /// Share of the frames that should see a landmark which must do so.
 const MIN_FOUND_SHARE: f64 = 0.25;
@@ -130,7 +130,8 @@ pub fn remove_unproven(map: &mut Map, newest_keyframe: usize) {
         let landmark = &map.landmarks[l];
         let age = newest_keyframe - landmark.born;
         let rarely_found = f64::from(landmark.found) < MIN_FOUND_SHARE * f64::from(landmark.visible);
-        let alone = age == PROBATION && landmark.sightings.len() < 2;
+        let measured = landmark.sightings.iter().any(|s| map.keyframes[s.keyframe].features.features[s.feature].depth_metres.is_some());
+        let alone = age == PROBATION && landmark.sightings.len() < if measured { 2 } else { 3 };
         if landmark.fate == Fate::Alive && (alone || (age <= PROBATION && rarely_found)) {
             map.remove_landmark(l);
         }

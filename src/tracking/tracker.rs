@@ -18,6 +18,9 @@ use crate::sequence::{Frame, Sensor};
 /// For this many frames after the camera was found again, poses are held to the stricter count.
 const FRESHLY_FOUND_FRAMES: usize = 5;
 
+/// Without depth, keyframes further apart are worth more: a window then spans a wider baseline, which is all that fixes the points.
+const MONO_SPACING: f64 = 1.65;
+
 /// A true pose agrees with well over half of its matches, one by chance with few.
 const MIN_INLIER_SHARE: f64 = 0.35;
 
@@ -68,11 +71,17 @@ impl Tracker {
     /// [`TrackingError::Config`] if a setting is out of its range.
     pub fn new(camera: Camera, sensor: Sensor, config: &TrackingConfig) -> Result<Self, TrackingError> {
         config.validate().map_err(TrackingError::Config)?;
+        let spacing = if sensor == Sensor::Mono { MONO_SPACING } else { 1.0 };
+        let config = TrackingConfig {
+            keyframe_translation: spacing * config.keyframe_translation,
+            keyframe_rotation_rad: spacing * config.keyframe_rotation_rad,
+            ..config.clone()
+        };
         Ok(Self {
             camera,
             sensor,
-            config: config.clone(),
-            extractor: Extractor::new(camera.pinhole.width, camera.pinhole.height, config),
+            extractor: Extractor::new(camera.pinhole.width, camera.pinhole.height, &config),
+            config,
             map: Map::default(),
             last: None,
             first_view: None,
