@@ -7,6 +7,7 @@
 
 mod bundle;
 mod config;
+mod dense;
 mod descriptor;
 mod error;
 mod features;
