@@ -1,5 +1,6 @@
 //! The features of one frame as the tracker uses them: undistorted, with depth, in a grid for searches around a pixel.
 
+use image::RgbImage;
 use nalgebra::{Point3, Vector2};
 
 use super::descriptor::Descriptor;
@@ -65,18 +66,17 @@ impl FrameFeatures {
 
     /// Extracts the features of a frame and finds their depths, from the depth image or from the right eye.
     pub fn of_frame(
-        frame: &Frame,
+        (frame, grey): (&Frame, &[u8]),
         (camera, sensor): (&Camera, Sensor),
         extractor: &Extractor,
         config: &TrackingConfig,
     ) -> Result<Self, TrackingError> {
-        let grey: Vec<u8> = frame.color.pixels().map(|p| luma(p.0)).collect();
         let (keypoints, depths) = match (sensor, &frame.right) {
             (Sensor::Stereo { baseline_metres }, Some(right)) => {
-                stereo_depths(&grey, right.as_raw(), camera.pinhole.fx * baseline_metres, camera.pinhole.fx, (extractor, config))?
+                stereo_depths(grey, right.as_raw(), camera.pinhole.fx * baseline_metres, camera.pinhole.fx, (extractor, config))?
             }
             _ => {
-                let keypoints = extractor.extract(&extractor.pyramid(&grey)?)?;
+                let keypoints = extractor.extract(&extractor.pyramid(grey)?)?;
                 let depth = |k: &Keypoint| believed_depth(frame.depth.as_ref()?, &k.pixel, config);
                 let depths = keypoints.iter().map(|k| Some((depth(k)?, config.inverse_depth_sigma))).collect();
                 (keypoints, depths)
@@ -95,7 +95,7 @@ impl FrameFeatures {
             })
             .filter(|f| f.pixel.iter().all(|v| v.is_finite()))
             .collect();
-        Ok(Self::new(features, thumbnail(&grey, frame.color.width() as usize, frame.color.height() as usize), &camera.pinhole))
+        Ok(Self::new(features, thumbnail(grey, frame.color.width() as usize, frame.color.height() as usize), &camera.pinhole))
     }
 
     pub fn len(&self) -> usize {
@@ -170,9 +170,10 @@ fn cell(coordinate: f64, count: usize) -> usize {
     ((coordinate / CELL_PIXELS).max(0.0) as usize).min(count - 1)
 }
 
-/// Rec. 601 luma in integers.
-fn luma([r, g, b]: [u8; 3]) -> u8 {
-    ((u32::from(r) * 77 + u32::from(g) * 150 + u32::from(b) * 29 + 128) >> 8) as u8
+/// Rec. 601 luma in integers, row-major.
+pub fn luma(image: &RgbImage) -> Vec<u8> {
+    let of = |[r, g, b]: [u8; 3]| ((u32::from(r) * 77 + u32::from(g) * 150 + u32::from(b) * 29 + 128) >> 8) as u8;
+    image.pixels().map(|p| of(p.0)).collect()
 }
 
 /// The depth at a recorded pixel, unless it is out of range, not finite, or on an edge.

@@ -49,6 +49,8 @@ pub struct Localised {
     pub matches: usize,
     /// Whether the pose came without a prediction.
     pub rough: bool,
+    /// Whether it is held by all pixels instead of by landmarks.
+    pub dense: bool,
 }
 
 /// Features whose points in the world are known (`None` where not), and the landmarks among these.
@@ -175,6 +177,29 @@ impl Context<'_> {
         found
     }
 
+    /// At a pose that something else has found: the landmarks that agree with it.
+    pub fn at_pose(&mut self, frame: &FrameFeatures, camera_from_world: Se3, reference: usize) -> Localised {
+        let blank = Localised {
+            camera_from_world,
+            landmarks: vec![None; frame.len()],
+            inliers: 0,
+            matches: 0,
+            rough: true,
+            dense: true,
+        };
+        let found = self.in_local_map(frame, &blank, reference);
+        let mut landmarks = found.landmarks;
+        for (feature, landmark) in landmarks.iter_mut().enumerate() {
+            let agrees = |l: &usize| {
+                let p_in_camera = (camera_from_world * self.map.landmarks[*l].position).coords;
+                frame.features[feature].measurement(self.config).judge(self.pinhole, &p_in_camera) != Trust::Outlier
+            };
+            *landmark = landmark.filter(agrees);
+        }
+        let inliers = landmarks.iter().flatten().count();
+        Localised { landmarks, inliers, ..blank }
+    }
+
     /// Optimises a pose over pairs (source that `known` knows the point of, feature) and keeps the landmarks that agree.
     fn settle(
         &self,
@@ -205,6 +230,7 @@ impl Context<'_> {
             inliers: estimate.inliers,
             matches: usable.len(),
             rough: false,
+            dense: false,
         }
     }
 

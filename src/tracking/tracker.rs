@@ -5,8 +5,9 @@
 use std::sync::Arc;
 use std::time::Instant;
 
+use super::dense::{DenseFrame, DenseSampler, align};
 use super::features::Extractor;
-use super::frame_features::FrameFeatures;
+use super::frame_features::{FrameFeatures, luma};
 use super::keyframe;
 use super::localise::{Context, Localised};
 use super::map::{Keyframe, Map};
@@ -17,6 +18,11 @@ use crate::sequence::{Frame, Sensor};
 
 /// For this many frames after the camera was found again, poses are held to the stricter count.
 const FRESHLY_FOUND_FRAMES: usize = 5;
+
+/// Frames without a pose after which pixels no longer say where the camera is.
+const MAX_FRAMES_BRIDGED: usize = 2;
+/// Overlap from which on the newest keyframe is the better reference than the last frame.
+const KEYFRAME_OVERLAP: f64 = 0.5;
 
 /// Without depth, keyframes further apart are worth more: a window then spans a wider baseline, which is all that fixes the points.
 const MONO_SPACING: f64 = 1.65;
@@ -41,8 +47,14 @@ pub struct Tracker {
     /// Keyframe that shares most landmarks with the last frame.
     reference: usize,
     lost: bool,
+    /// In a row, until now.
+    frames_lost: usize,
     frames_since_found: usize,
     frames_seen: usize,
+    /// For RGB-D: the last tracked frame and the newest keyframe as [`align`] takes them.
+    sampler: Option<DenseSampler>,
+    dense_last: Option<Arc<DenseFrame>>,
+    dense_keyframe: Option<(usize, Arc<DenseFrame>)>,
     records: Vec<Record>,
 }
 
@@ -88,6 +100,10 @@ impl Tracker {
             velocity: None,
             reference: 0,
             lost: false,
+            frames_lost: 0,
+            sampler: (sensor == Sensor::Rgbd).then(|| DenseSampler::new(&camera)),
+            dense_last: None,
+            dense_keyframe: None,
             frames_since_found: FRESHLY_FOUND_FRAMES,
             frames_seen: 0,
             records: Vec::new(),
@@ -104,19 +120,30 @@ impl Tracker {
         self.frames_seen += 1;
         let mut times = StageTimes::default();
         let clock = Instant::now();
-        let features = Arc::new(FrameFeatures::of_frame(frame, (&self.camera, self.sensor), &self.extractor, &self.config)?);
+        let grey = luma(&frame.color);
+        let setting = (&self.camera, self.sensor);
+        let features = Arc::new(FrameFeatures::of_frame((frame, &grey), setting, &self.extractor, &self.config)?);
+        let sampled = self.sampler.as_ref().zip(frame.depth.as_ref());
+        let dense = sampled.map(|(sampler, depth)| Arc::new(sampler.sample(&grey, depth, &self.config)));
         times.features_ms = milliseconds(clock);
         let Some(last) = self.last.take() else {
             let start = if self.sensor == Sensor::Mono { Self::start_without_depth } else { Self::start };
-            return Ok(start(self, frame, features, may_be_keyframe, times));
+            let tracked = start(self, frame, features, may_be_keyframe, times);
+            self.keep_dense(dense, tracked.keyframe.is_some());
+            return Ok(tracked);
         };
         let clock = Instant::now();
-        let found = self.localise(&features, &last);
+        let found = self.localise(&features, &last).or_else(|| self.localise_densely(dense.as_deref(), &features, &last));
         times.localise_ms = milliseconds(clock);
         let tracked = match found {
-            Some(found) => self.accept(frame, features, &last, found, may_be_keyframe, times),
+            Some(found) => {
+                let tracked = self.accept(frame, features, &last, found, may_be_keyframe, times);
+                self.keep_dense(dense, tracked.keyframe.is_some());
+                tracked
+            }
             None => {
                 self.last = Some(last);
+                self.frames_lost += 1;
                 self.lost = true;
                 self.velocity = None;
                 TrackedFrame::lost(times)
@@ -261,6 +288,38 @@ impl Tracker {
         found.filter(trusted)
     }
 
+    /// The frame's pose from all its pixels, where features did not give it: against the last frame, then against the newest keyframe,
+    /// which drifts less.
+    fn localise_densely(&mut self, dense: Option<&DenseFrame>, features: &FrameFeatures, last: &LastFrame) -> Option<Localised> {
+        if self.frames_lost > MAX_FRAMES_BRIDGED {
+            return None;
+        }
+        let (frame, before) = (dense?, self.dense_last.as_ref()?);
+        let guesses = [self.velocity.unwrap_or_default(), Se3::identity()];
+        let mut camera_from_world =
+            align(before, frame, &guesses, &self.config)?.current_from_reference * last.camera_from_world;
+        if let Some((keyframe, view)) = &self.dense_keyframe {
+            let pose = self.map.keyframes[*keyframe].camera_from_world;
+            let guess = camera_from_world * pose.inverse();
+            if let Some(found) = align(view, frame, &[guess], &self.config).filter(|found| found.overlap >= KEYFRAME_OVERLAP) {
+                camera_from_world = found.current_from_reference * pose;
+            }
+        }
+        let mut context = Context { map: &mut self.map, pinhole: &self.camera.pinhole, config: &self.config };
+        Some(context.at_pose(features, camera_from_world, self.reference))
+    }
+
+    /// Keeps a tracked frame's pixels for the next.
+    fn keep_dense(&mut self, dense: Option<Arc<DenseFrame>>, is_keyframe: bool) {
+        if self.last.is_none() {
+            return;
+        }
+        if is_keyframe {
+            self.dense_keyframe = dense.clone().map(|view| (self.map.keyframes.len() - 1, view));
+        }
+        self.dense_last = dense;
+    }
+
     /// Takes a trusted pose in: motion, reference, record, and a keyframe if one is due.
     fn accept(
         &mut self,
@@ -274,6 +333,7 @@ impl Tracker {
         self.frames_since_found = if self.lost { 0 } else { self.frames_since_found + 1 };
         self.velocity = (!self.lost).then(|| found.camera_from_world * last.camera_from_world.inverse());
         self.lost = false;
+        self.frames_lost = 0;
         let votes = self.map.votes(found.landmarks.iter().flatten().copied());
         self.reference = votes.first().map_or(self.reference, |(k, _)| *k);
         let inliers = found.inliers;
@@ -307,6 +367,7 @@ impl Tracker {
         times: &mut StageTimes,
     ) -> (NewKeyframe, Vec<(usize, Se3)>) {
         let (pinhole, config) = (&self.camera.pinhole, &self.config);
+        let held_by_landmarks = !found.dense;
         let clock = Instant::now();
         let keyframe = Keyframe {
             frame_index: frame.index,
@@ -321,7 +382,8 @@ impl Tracker {
         mapping::remove_unproven(&mut self.map, id);
         times.mapping_ms = milliseconds(clock);
         let clock = Instant::now();
-        let moved = window::adjust_window(&mut self.map, id, pinhole, config);
+        // A keyframe that few landmarks hold would be torn from where its pixels put it.
+        let moved = if held_by_landmarks { window::adjust_window(&mut self.map, id, pinhole, config) } else { Vec::new() };
         times.bundle_ms = milliseconds(clock);
         let pose = |k: usize| self.map.keyframes[k].camera_from_world;
         let updates = moved.into_iter().filter(|k| *k != id).map(|k| (k, pose(k).inverse())).collect();
