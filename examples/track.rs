@@ -5,9 +5,9 @@
 use std::error::Error;
 use std::path::Path;
 
+use clap::ValueEnum;
 use keysplat::evaluation::{Alignment, evaluate_trajectory};
 use keysplat::geometry::Trajectory;
-use clap::ValueEnum;
 use keysplat::sequence::{SensorKind, Sequence};
 use keysplat::tracking::{StageTimes, Tracker, TrackingConfig, TrackingState};
 

@@ -12,9 +12,11 @@ use crate::sequence::DepthImage;
 
 const SCALE: f64 = 0.25;
 /// Halvings of that, coarsest first, with the iterations on each.
-const LEVELS: [(u32, usize); 3] = [(2, 16), (1, 12), (0, 10)];
-/// Standard deviations: of a point's distance from a plane as a share of inverse depth's, and of brightness, grey levels.
-const GREY_SIGMA: f64 = 12.0;
+const LEVELS: [(u32, usize); 4] = [(3, 20), (2, 16), (1, 12), (0, 10)];
+/// Standard deviations of inverse depth among neighbouring pixels (1/metres; less than a lone keypoint's, which may lie on an edge), and of
+/// brightness, grey levels.
+const INVERSE_DEPTH_SIGMA: f64 = 0.004;
+const GREY_SIGMA: f64 = 20.0;
 /// Residuals beyond this many standard deviations pull less and less (Huber), at the finest level; each coarser one takes twice that.
 const HUBER: f64 = 1.5;
 /// Beyond this times Huber's threshold two points are of different surfaces.
@@ -27,7 +29,7 @@ const MIN_AGREEMENT: f64 = 0.55;
 /// And of all points.
 const MIN_OVERLAP: f64 = 0.3;
 /// The least information about any direction of motion, per point: (1/m)² or (1/rad)² over the squared residuals' scale.
-const MIN_INFORMATION: f64 = 2e-3;
+const MIN_INFORMATION: f64 = 0.05;
 
 /// A frame for dense alignment, `[height * width]` each.
 #[derive(Clone, Debug)]
@@ -157,7 +159,7 @@ struct Sums {
 
 /// The pose of `current` relative to `reference`, from the best of some initial guesses; `None` where the two do not agree, or the scene
 /// does not hold the pose (a single plane without texture).
-pub fn align(reference: &DenseFrame, current: &DenseFrame, guesses: &[Se3], config: &TrackingConfig) -> Option<Aligned> {
+pub fn align(reference: &DenseFrame, current: &DenseFrame, guesses: &[Se3]) -> Option<Aligned> {
     let mut best: Option<(f64, Aligned)> = None;
     let levels: Vec<(Level, Level, usize, f64)> = LEVELS
         .iter()
@@ -168,27 +170,27 @@ pub fn align(reference: &DenseFrame, current: &DenseFrame, guesses: &[Se3], conf
     for guess in guesses {
         let mut pose = *guess;
         for (reference, current, steps, huber) in &levels {
-            pose = descend(reference, current, pose, (*steps, *huber), config);
+            pose = descend(reference, current, pose, (*steps, *huber));
         }
         let (reference, current, _, huber) = &levels[levels.len() - 1];
-        let sums = linearise(reference, current, &pose, *huber, config);
+        let sums = linearise(reference, current, &pose, *huber);
         let agreement = sums.agree as f64 / sums.in_view.max(1) as f64;
         let overlap = sums.agree as f64 / sums.points.max(1) as f64;
         let information = SymmetricEigen::new(sums.hessian / sums.agree.max(1) as f64).eigenvalues.min();
         let held = agreement >= MIN_AGREEMENT && overlap >= MIN_OVERLAP && information >= MIN_INFORMATION;
-        let score = agreement * overlap;
-        if held && best.as_ref().is_none_or(|(s, _)| score > *s) {
-            best = Some((score, Aligned { current_from_reference: pose, overlap }));
+        let cost = sums.cost / sums.in_view.max(1) as f64;
+        if held && best.as_ref().is_none_or(|(least, _)| cost < *least) {
+            best = Some((cost, Aligned { current_from_reference: pose, overlap }));
         }
     }
     best.map(|(_, aligned)| aligned)
 }
 
 /// Gauss-Newton with damping on one level.
-fn descend(reference: &Level, current: &Level, initial: Se3, (steps, huber): (usize, f64), config: &TrackingConfig) -> Se3 {
+fn descend(reference: &Level, current: &Level, initial: Se3, (steps, huber): (usize, f64)) -> Se3 {
     let mut pose = initial;
     for _ in 0..steps {
-        let sums = linearise(reference, current, &pose, huber, config);
+        let sums = linearise(reference, current, &pose, huber);
         let mut damped = sums.hessian;
         (0..6).for_each(|k| damped[(k, k)] += 1e-3 * sums.hessian[(k, k)] + 1e-3);
         let Some(step) = damped.cholesky().map(|c| c.solve(&-sums.gradient)) else { break };
@@ -201,7 +203,7 @@ fn descend(reference: &Level, current: &Level, initial: Se3, (steps, huber): (us
     pose
 }
 
-fn linearise(reference: &Level, current: &Level, pose: &Se3, huber: f64, config: &TrackingConfig) -> Sums {
+fn linearise(reference: &Level, current: &Level, pose: &Se3, huber: f64) -> Sums {
     let mut sums = Sums::default();
     let offset = brightness_offset(reference, current, pose);
     let pinhole = &current.pinhole;
@@ -214,9 +216,10 @@ fn linearise(reference: &Level, current: &Level, pose: &Se3, huber: f64, config:
         let (Some(target), Some(facing)) = (current.points[at], current.normals[at]) else { continue };
         sums.in_view += 1;
         // Distance from the plane, in standard deviations of what the sensor measures there.
-        let sigma = config.inverse_depth_sigma * target.z * target.z;
+        let sigma = INVERSE_DEPTH_SIGMA * target.z * target.z;
         let distance = facing.dot(&(p.coords - target)) / sigma.max(1e-4);
         if distance.abs() > GATE * huber || (pose.rotation * normal).dot(&facing) < NORMAL_COSINE {
+            sums.cost += GATE * huber * huber;
             continue;
         }
         sums.agree += 1;
@@ -268,7 +271,11 @@ mod tests {
     use crate::geometry::Distortion;
     use nalgebra::{Point3, Vector2};
 
-    const CAMERA: Camera = Camera { pinhole: PINHOLE, distortion: Distortion { k1: 0.0, k2: 0.0, p1: 0.0, p2: 0.0, k3: 0.0 }, depth_units_per_metre: 5000.0 };
+    const CAMERA: Camera = Camera {
+        pinhole: PINHOLE,
+        distortion: Distortion { k1: 0.0, k2: 0.0, p1: 0.0, p2: 0.0, k3: 0.0 },
+        depth_units_per_metre: 5000.0,
+    };
 
     /// A room's corner: three planes, grey with soft stripes. The nearest hit along each pixel's line of sight.
     fn corner(camera_from_world: &Se3) -> DenseFrame {
@@ -298,7 +305,7 @@ mod tests {
     fn a_corner_without_features_holds_the_pose() {
         let truth = se3::exp(&Vector6::new(0.12, -0.06, 0.1, 0.04, -0.07, 0.05));
         let (reference, current) = (corner(&Se3::identity()), corner(&truth));
-        let found = align(&reference, &current, &[Se3::identity()], &TrackingConfig::default()).unwrap();
+        let found = align(&reference, &current, &[Se3::identity()]).unwrap();
         let error = se3::log(&(found.current_from_reference * truth.inverse()));
         assert!(error.norm() < 5e-3, "{error}");
         assert!(found.overlap > 0.5);
@@ -306,14 +313,13 @@ mod tests {
 
     #[test]
     fn what_does_not_fit_or_does_not_hold_is_refused() {
-        let config = TrackingConfig::default();
         let reference = corner(&Se3::identity());
         let elsewhere = corner(&se3::exp(&Vector6::new(0.0, 0.0, 0.0, 0.0, 1.2, 0.0)));
-        assert!(align(&reference, &elsewhere, &[Se3::identity()], &config).is_none());
+        assert!(align(&reference, &elsewhere, &[Se3::identity()]).is_none());
         // A blank wall says nothing about sliding along it.
         let wall = DenseFrame { depth: vec![2.0; 160 * 120], grey: vec![100.0; 160 * 120], pinhole: PINHOLE.scaled(SCALE) };
-        assert!(align(&wall, &wall, &[Se3::identity()], &config).is_none());
+        assert!(align(&wall, &wall, &[Se3::identity()]).is_none());
         let blind = DenseFrame { depth: vec![0.0; 160 * 120], ..wall.clone() };
-        assert!(align(&blind, &wall, &[Se3::identity()], &config).is_none());
+        assert!(align(&blind, &wall, &[Se3::identity()]).is_none());
     }
 }

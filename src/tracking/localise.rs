@@ -179,14 +179,8 @@ impl Context<'_> {
 
     /// At a pose that something else has found: the landmarks that agree with it.
     pub fn at_pose(&mut self, frame: &FrameFeatures, camera_from_world: Se3, reference: usize) -> Localised {
-        let blank = Localised {
-            camera_from_world,
-            landmarks: vec![None; frame.len()],
-            inliers: 0,
-            matches: 0,
-            rough: true,
-            dense: true,
-        };
+        let blank =
+            Localised { camera_from_world, landmarks: vec![None; frame.len()], inliers: 0, matches: 0, rough: true, dense: true };
         let found = self.in_local_map(frame, &blank, reference);
         let mut landmarks = found.landmarks;
         for (feature, landmark) in landmarks.iter_mut().enumerate() {

@@ -130,7 +130,8 @@ pub fn remove_unproven(map: &mut Map, newest_keyframe: usize) {
         let landmark = &map.landmarks[l];
         let age = newest_keyframe - landmark.born;
         let rarely_found = f64::from(landmark.found) < MIN_FOUND_SHARE * f64::from(landmark.visible);
-        let measured = landmark.sightings.iter().any(|s| map.keyframes[s.keyframe].features.features[s.feature].depth_metres.is_some());
+        let measured =
+            landmark.sightings.iter().any(|s| map.keyframes[s.keyframe].features.features[s.feature].depth_metres.is_some());
         let alone = age == PROBATION && landmark.sightings.len() < if measured { 2 } else { 3 };
         if landmark.fate == Fate::Alive && (alone || (age <= PROBATION && rarely_found)) {
             map.remove_landmark(l);

@@ -25,7 +25,12 @@ pub struct Eye<'a> {
 }
 
 /// The disparity of each left keypoint in pixels at full size, above 0 and at most `max_disparity`; `None` where no match is found.
-pub fn disparities(left: Eye<'_>, right: Eye<'_>, max_disparity: f64, level_scale: f64) -> Result<Vec<Option<f64>>, TrackingError> {
+pub fn disparities(
+    left: Eye<'_>,
+    right: Eye<'_>,
+    max_disparity: f64,
+    level_scale: f64,
+) -> Result<Vec<Option<f64>>, TrackingError> {
     let rows = by_row(right.keypoints, level_scale);
     let mut found: Vec<Option<(f64, f64)>> = Vec::with_capacity(left.keypoints.len());
     for keypoint in left.keypoints {
@@ -164,7 +169,9 @@ mod tests {
             (0..60).map(|_| [random.f64() * 0.9 - 0.45, random.f64() * 0.9 - 0.45, random.f64() * 6.28, random.f64()]).collect();
         let value = |x: f64, y: f64| 128.0 + 9.0 * waves.iter().map(|[a, b, c, d]| d * (a * x + b * y + c).sin()).sum::<f64>();
         let picture = |offset: f64, light: f64| {
-            (0..320 * 240).map(|i| (light * value(f64::from(i % 320) + offset, f64::from(i / 320))).clamp(0.0, 255.0) as u8).collect()
+            (0..320 * 240)
+                .map(|i| (light * value(f64::from(i % 320) + offset, f64::from(i / 320))).clamp(0.0, 255.0) as u8)
+                .collect()
         };
         (picture(0.0, 1.0), picture(shift, 0.95))
     }

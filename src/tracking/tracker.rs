@@ -12,13 +12,18 @@ use super::keyframe;
 use super::localise::{Context, Localised};
 use super::map::{Keyframe, Map};
 use super::mono::{self, FirstView};
-use super::{KeyframePose, NewKeyframe, StageTimes, TrackedFrame, TrackingConfig, TrackingError, TrackingState, mapping, triangulate, window};
+use super::{
+    KeyframePose, NewKeyframe, StageTimes, TrackedFrame, TrackingConfig, TrackingError, TrackingState, mapping, triangulate,
+    window,
+};
 use crate::geometry::{Camera, Se3, StampedPose};
 use crate::sequence::{Frame, Sensor};
 
 /// For this many frames after the camera was found again, poses are held to the stricter count.
 const FRESHLY_FOUND_FRAMES: usize = 5;
 
+/// With fewer landmarks than this a pose is checked against all pixels, where there is depth.
+const FEW_INLIERS: usize = 50;
 /// Frames without a pose after which pixels no longer say where the camera is.
 const MAX_FRAMES_BRIDGED: usize = 2;
 /// Overlap from which on the newest keyframe is the better reference than the last frame.
@@ -133,7 +138,11 @@ impl Tracker {
             return Ok(tracked);
         };
         let clock = Instant::now();
-        let found = self.localise(&features, &last).or_else(|| self.localise_densely(dense.as_deref(), &features, &last));
+        let mut found = self.localise(&features, &last);
+        if found.as_ref().is_none_or(|f| f.inliers < FEW_INLIERS) {
+            let guess = found.as_ref().map(|f| f.camera_from_world);
+            found = self.localise_densely(dense.as_deref(), &features, &last, guess).or(found);
+        }
         times.localise_ms = milliseconds(clock);
         let tracked = match found {
             Some(found) => {
@@ -183,7 +192,9 @@ impl Tracker {
         size("colour", frame.color.dimensions())?;
         match &frame.depth {
             Some(depth) => size("depth", (depth.width, depth.height)),
-            None if self.frames_seen == 0 && self.sensor == Sensor::Rgbd => Err(TrackingError::FirstFrameWithoutDepth { frame: frame.index }),
+            None if self.frames_seen == 0 && self.sensor == Sensor::Rgbd => {
+                Err(TrackingError::FirstFrameWithoutDepth { frame: frame.index })
+            }
             None => Ok(()),
         }
     }
@@ -216,13 +227,7 @@ impl Tracker {
     }
 
     /// Starts the map with two frames that show one scene from two places.
-    fn start_without_depth(
-        &mut self,
-        frame: &Frame,
-        features: Arc<FrameFeatures>,
-        may: bool,
-        times: StageTimes,
-    ) -> TrackedFrame {
+    fn start_without_depth(&mut self, frame: &Frame, features: Arc<FrameFeatures>, may: bool, times: StageTimes) -> TrackedFrame {
         if !may {
             return TrackedFrame::lost(times);
         }
@@ -290,18 +295,24 @@ impl Tracker {
 
     /// The frame's pose from all its pixels, where features did not give it: against the last frame, then against the newest keyframe,
     /// which drifts less.
-    fn localise_densely(&mut self, dense: Option<&DenseFrame>, features: &FrameFeatures, last: &LastFrame) -> Option<Localised> {
+    fn localise_densely(
+        &mut self,
+        dense: Option<&DenseFrame>,
+        features: &FrameFeatures,
+        last: &LastFrame,
+        guess: Option<Se3>,
+    ) -> Option<Localised> {
         if self.frames_lost > MAX_FRAMES_BRIDGED {
             return None;
         }
         let (frame, before) = (dense?, self.dense_last.as_ref()?);
-        let guesses = [self.velocity.unwrap_or_default(), Se3::identity()];
-        let mut camera_from_world =
-            align(before, frame, &guesses, &self.config)?.current_from_reference * last.camera_from_world;
+        let mut guesses = vec![self.velocity.unwrap_or_default(), Se3::identity()];
+        guesses.extend(guess.map(|pose| pose * last.camera_from_world.inverse()));
+        let mut camera_from_world = align(before, frame, &guesses)?.current_from_reference * last.camera_from_world;
         if let Some((keyframe, view)) = &self.dense_keyframe {
             let pose = self.map.keyframes[*keyframe].camera_from_world;
             let guess = camera_from_world * pose.inverse();
-            if let Some(found) = align(view, frame, &[guess], &self.config).filter(|found| found.overlap >= KEYFRAME_OVERLAP) {
+            if let Some(found) = align(view, frame, &[guess]).filter(|found| found.overlap >= KEYFRAME_OVERLAP) {
                 camera_from_world = found.current_from_reference * pose;
             }
         }

@@ -111,7 +111,8 @@ fn match_along_lines(
         let Some((theirs, distance)) = best_on_line(feature, &line, other, &candidates, config) else { continue };
         let found = &other.features.features[theirs];
         let Some(met) = triangulate(&views.0, &feature.pixel, &views.1, &found.pixel) else { continue };
-        let agrees = met.parallax_cosine < MAX_PARALLAX_COSINE && agree(&met.point, (feature, this), (found, other), pinhole, config);
+        let agrees =
+            met.parallax_cosine < MAX_PARALLAX_COSINE && agree(&met.point, (feature, this), (found, other), pinhole, config);
         if agrees && taken[theirs].is_none_or(|(d, ..)| distance < d) {
             taken[theirs] = Some((distance, mine, met.point));
         }
@@ -170,9 +171,15 @@ fn agree(
 /// F with `b·F·a = 0` for pixels `a` and `b` of one point, from `b_from_a`.
 pub fn fundamental(b_from_a: &Se3, pinhole: &Pinhole) -> Matrix3<f64> {
     let inverse = Matrix3::new(
-        1.0 / pinhole.fx, 0.0, -pinhole.cx / pinhole.fx,
-        0.0, 1.0 / pinhole.fy, -pinhole.cy / pinhole.fy,
-        0.0, 0.0, 1.0,
+        1.0 / pinhole.fx,
+        0.0,
+        -pinhole.cx / pinhole.fx,
+        0.0,
+        1.0 / pinhole.fy,
+        -pinhole.cy / pinhole.fy,
+        0.0,
+        0.0,
+        1.0,
     );
     inverse.transpose() * skew(&b_from_a.translation.vector) * b_from_a.rotation.to_rotation_matrix().matrix() * inverse
 }
