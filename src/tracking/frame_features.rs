@@ -143,7 +143,10 @@ impl Feature {
     }
 }
 
-/// Keypoints of the left image, and their `(depth, standard deviation of the inverse depth)` from the right one. `scale` is the product
+/// Metres and the standard deviation of the inverse depth, 1/metres, where a depth was measured.
+type MeasuredDepth = Option<(f64, f64)>;
+
+/// Keypoints of the left image, and their depths from the right one. `scale` is the product
 /// of focal length and baseline: depth = scale / disparity.
 fn stereo_depths(
     left: &[u8],
@@ -151,7 +154,7 @@ fn stereo_depths(
     scale: f64,
     max_disparity: f64,
     (extractor, config): (&Extractor, &TrackingConfig),
-) -> Result<(Vec<Keypoint>, Vec<Option<(f64, f64)>>), TrackingError> {
+) -> Result<(Vec<Keypoint>, Vec<MeasuredDepth>), TrackingError> {
     let eye = |grey| -> Result<_, TrackingError> {
         let pyramid = extractor.pyramid(grey)?;
         Ok((extractor.extract(&pyramid)?, pyramid))

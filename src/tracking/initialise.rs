@@ -64,10 +64,8 @@ struct Candidates {
 }
 
 fn motions(matches: &[(Vector2<f64>, Vector2<f64>)], pinhole: &Pinhole) -> Result<Candidates, TrackingError> {
-    let points = |pick: fn(&(Vector2<f64>, Vector2<f64>)) -> Vector2<f64>| -> Vector<Point2d> {
-        matches.iter().map(|m| Point2d::new(pick(m).x, pick(m).y)).collect()
-    };
-    let (first, second) = (points(|m| m.0), points(|m| m.1));
+    let first: Vector<Point2d> = matches.iter().map(|(a, _)| Point2d::new(a.x, a.y)).collect();
+    let second: Vector<Point2d> = matches.iter().map(|(_, b)| Point2d::new(b.x, b.y)).collect();
     let camera = Matrix3::new(pinhole.fx, 0.0, pinhole.cx, 0.0, pinhole.fy, pinhole.cy, 0.0, 0.0, 1.0);
     let k = to_mat(&camera)?;
     let mut mask = Mat::default();

@@ -165,8 +165,9 @@ mod tests {
     /// A smooth random picture, and the same seen `shift` pixels further left and a little darker.
     fn pair(shift: f64) -> (Vec<u8>, Vec<u8>) {
         let mut random = fastrand::Rng::with_seed(3);
-        let waves: Vec<[f64; 4]> =
-            (0..60).map(|_| [random.f64() * 0.9 - 0.45, random.f64() * 0.9 - 0.45, random.f64() * 6.28, random.f64()]).collect();
+        let waves: Vec<[f64; 4]> = (0..60)
+            .map(|_| [random.f64() * 0.9 - 0.45, random.f64() * 0.9 - 0.45, random.f64() * std::f64::consts::TAU, random.f64()])
+            .collect();
         let value = |x: f64, y: f64| 128.0 + 9.0 * waves.iter().map(|[a, b, c, d]| d * (a * x + b * y + c).sin()).sum::<f64>();
         let picture = |offset: f64, light: f64| {
             (0..320 * 240)

@@ -2,16 +2,19 @@
 //!
 //! It leaves out what the rest of the project does elsewhere or not at all: loop closing over large drift, and rendering.
 
+mod start;
+mod without_features;
+
 use std::sync::Arc;
 use std::time::Instant;
 
-use super::dense::{DenseFrame, DenseSampler, align};
+use super::dense::{DenseFrame, DenseSampler};
 use super::features::Extractor;
 use super::frame_features::{FrameFeatures, luma};
 use super::keyframe;
 use super::localise::{Context, Localised};
 use super::map::{Keyframe, Map};
-use super::mono::{self, FirstView};
+use super::mono::FirstView;
 use super::{
     KeyframePose, NewKeyframe, StageTimes, TrackedFrame, TrackingConfig, TrackingError, TrackingState, mapping, triangulate,
     window,
@@ -24,11 +27,6 @@ const FRESHLY_FOUND_FRAMES: usize = 5;
 
 /// With fewer landmarks than this a pose is checked against all pixels, where there is depth.
 const FEW_INLIERS: usize = 50;
-/// Frames without a pose after which pixels no longer say where the camera is.
-const MAX_FRAMES_BRIDGED: usize = 2;
-/// Overlap from which on the newest keyframe is the better reference than the last frame.
-const KEYFRAME_OVERLAP: f64 = 0.5;
-
 /// Without depth, keyframes further apart are worth more: a window then spans a wider baseline, which is all that fixes the points.
 const MONO_SPACING: f64 = 1.65;
 
@@ -199,69 +197,6 @@ impl Tracker {
         }
     }
 
-    /// Starts the map with a frame that shows enough.
-    fn start(&mut self, frame: &Frame, features: Arc<FrameFeatures>, may: bool, times: StageTimes) -> TrackedFrame {
-        let with_depth = features.features.iter().filter(|f| f.depth_metres.is_some()).count();
-        if !may || with_depth < self.config.min_initial_landmarks {
-            return TrackedFrame::lost(times);
-        }
-        let keyframe = Keyframe {
-            frame_index: frame.index,
-            timestamp_s: frame.timestamp_s,
-            camera_from_world: Se3::identity(),
-            features: features.clone(),
-            landmarks: Vec::new(),
-        };
-        let id = mapping::insert_keyframe(&mut self.map, keyframe, &self.camera.pinhole, &self.config);
-        let landmarks = self.map.keyframes[id].landmarks.clone();
-        self.last = Some(LastFrame { features, camera_from_world: Se3::identity(), landmarks });
-        self.record(frame, id, Se3::identity());
-        TrackedFrame {
-            state: TrackingState::Tracking,
-            world_from_camera: Some(Se3::identity()),
-            inliers: with_depth,
-            keyframe: Some(NewKeyframe { id, world_from_camera: Se3::identity(), covisible: Vec::new() }),
-            updates: Vec::new(),
-            times,
-        }
-    }
-
-    /// Starts the map with two frames that show one scene from two places.
-    fn start_without_depth(&mut self, frame: &Frame, features: Arc<FrameFeatures>, may: bool, times: StageTimes) -> TrackedFrame {
-        if !may {
-            return TrackedFrame::lost(times);
-        }
-        let (pinhole, config) = (&self.camera.pinhole, &self.config);
-        let matches = self.first_view.as_mut().and_then(|first| first.follow(&features, pinhole));
-        let (Some(first), Some(matches)) = (&self.first_view, matches) else {
-            self.first_view = Some(FirstView::new(frame.index, frame.timestamp_s, features));
-            return TrackedFrame::lost(times);
-        };
-        let this = (frame.index, frame.timestamp_s, &features);
-        let Some(map) = mono::first_map(first, this, &matches, pinhole, config) else { return TrackedFrame::lost(times) };
-        self.map = map;
-        self.first_view = None;
-        let keyframes = self.keyframes();
-        let [first, second] = &keyframes[..] else { return TrackedFrame::lost(times) };
-        for keyframe in [first, second] {
-            let (frame_index, timestamp_s, reference) = (keyframe.frame_index, keyframe.timestamp_s, keyframe.id);
-            self.records.push(Record { frame_index, timestamp_s, reference, camera_from_reference: Se3::identity() });
-        }
-        let (id, world_from_camera) = (second.id, second.world_from_camera);
-        self.reference = id;
-        let landmarks = self.map.keyframes[id].landmarks.clone();
-        let inliers = landmarks.iter().flatten().count();
-        self.last = Some(LastFrame { features, camera_from_world: world_from_camera.inverse(), landmarks });
-        TrackedFrame {
-            state: TrackingState::Tracking,
-            world_from_camera: Some(world_from_camera),
-            inliers,
-            keyframe: Some(NewKeyframe { id, world_from_camera, covisible: self.map.covisible(id) }),
-            updates: Vec::new(),
-            times,
-        }
-    }
-
     /// The frame's pose, if it can be trusted.
     fn localise(&mut self, features: &FrameFeatures, last: &LastFrame) -> Option<Localised> {
         let strict = self.lost || self.frames_since_found < FRESHLY_FOUND_FRAMES;
@@ -291,44 +226,6 @@ impl Tracker {
             finite && f.inliers as f64 >= MIN_INLIER_SHARE * f.matches as f64
         };
         found.filter(trusted)
-    }
-
-    /// The frame's pose from all its pixels, where features did not give it: against the last frame, then against the newest keyframe,
-    /// which drifts less.
-    fn localise_densely(
-        &mut self,
-        dense: Option<&DenseFrame>,
-        features: &FrameFeatures,
-        last: &LastFrame,
-        guess: Option<Se3>,
-    ) -> Option<Localised> {
-        if self.frames_lost > MAX_FRAMES_BRIDGED {
-            return None;
-        }
-        let (frame, before) = (dense?, self.dense_last.as_ref()?);
-        let mut guesses = vec![self.velocity.unwrap_or_default(), Se3::identity()];
-        guesses.extend(guess.map(|pose| pose * last.camera_from_world.inverse()));
-        let mut camera_from_world = align(before, frame, &guesses)?.current_from_reference * last.camera_from_world;
-        if let Some((keyframe, view)) = &self.dense_keyframe {
-            let pose = self.map.keyframes[*keyframe].camera_from_world;
-            let guess = camera_from_world * pose.inverse();
-            if let Some(found) = align(view, frame, &[guess]).filter(|found| found.overlap >= KEYFRAME_OVERLAP) {
-                camera_from_world = found.current_from_reference * pose;
-            }
-        }
-        let mut context = Context { map: &mut self.map, pinhole: &self.camera.pinhole, config: &self.config };
-        Some(context.at_pose(features, camera_from_world, self.reference))
-    }
-
-    /// Keeps a tracked frame's pixels for the next.
-    fn keep_dense(&mut self, dense: Option<Arc<DenseFrame>>, is_keyframe: bool) {
-        if self.last.is_none() {
-            return;
-        }
-        if is_keyframe {
-            self.dense_keyframe = dense.clone().map(|view| (self.map.keyframes.len() - 1, view));
-        }
-        self.dense_last = dense;
     }
 
     /// Takes a trusted pose in: motion, reference, record, and a keyframe if one is due.

@@ -134,7 +134,8 @@ fn best_on_line(
         let candidate = &other.features.features[i];
         let off = line.x * candidate.pixel.x + line.y * candidate.pixel.y + line.z;
         let sigma = config.pixel_sigma * config.pyramid_scale.powi(candidate.octave.into());
-        if !(off * off <= CHI2_LINE * sigma * sigma * norm_squared) || candidate.octave.abs_diff(feature.octave) > 2 {
+        let near = off * off <= CHI2_LINE * sigma * sigma * norm_squared;
+        if !near || candidate.octave.abs_diff(feature.octave) > 2 {
             continue;
         }
         let distance = candidate.descriptor.distance(&feature.descriptor);

@@ -1,0 +1,82 @@
+//! How a map begins: with one frame where there is depth, else with two.
+
+use std::sync::Arc;
+
+use super::super::frame_features::FrameFeatures;
+use super::super::map::Keyframe;
+use super::super::mono::{self, FirstView};
+use super::super::{NewKeyframe, StageTimes, TrackedFrame, TrackingState, mapping};
+use super::{LastFrame, Record, Tracker};
+use crate::geometry::Se3;
+use crate::sequence::Frame;
+
+impl Tracker {
+    /// Starts the map with a frame that shows enough.
+    pub(super) fn start(&mut self, frame: &Frame, features: Arc<FrameFeatures>, may: bool, times: StageTimes) -> TrackedFrame {
+        let with_depth = features.features.iter().filter(|f| f.depth_metres.is_some()).count();
+        if !may || with_depth < self.config.min_initial_landmarks {
+            return TrackedFrame::lost(times);
+        }
+        let keyframe = Keyframe {
+            frame_index: frame.index,
+            timestamp_s: frame.timestamp_s,
+            camera_from_world: Se3::identity(),
+            features: features.clone(),
+            landmarks: Vec::new(),
+        };
+        let id = mapping::insert_keyframe(&mut self.map, keyframe, &self.camera.pinhole, &self.config);
+        let landmarks = self.map.keyframes[id].landmarks.clone();
+        self.last = Some(LastFrame { features, camera_from_world: Se3::identity(), landmarks });
+        self.record(frame, id, Se3::identity());
+        TrackedFrame {
+            state: TrackingState::Tracking,
+            world_from_camera: Some(Se3::identity()),
+            inliers: with_depth,
+            keyframe: Some(NewKeyframe { id, world_from_camera: Se3::identity(), covisible: Vec::new() }),
+            updates: Vec::new(),
+            times,
+        }
+    }
+
+    /// Starts the map with two frames that show one scene from two places.
+    pub(super) fn start_without_depth(
+        &mut self,
+        frame: &Frame,
+        features: Arc<FrameFeatures>,
+        may: bool,
+        times: StageTimes,
+    ) -> TrackedFrame {
+        if !may {
+            return TrackedFrame::lost(times);
+        }
+        let (pinhole, config) = (&self.camera.pinhole, &self.config);
+        let matches = self.first_view.as_mut().and_then(|first| first.follow(&features, pinhole));
+        let (Some(first), Some(matches)) = (&self.first_view, matches) else {
+            self.first_view = Some(FirstView::new(frame.index, frame.timestamp_s, features));
+            return TrackedFrame::lost(times);
+        };
+        let this = (frame.index, frame.timestamp_s, &features);
+        let Some(map) = mono::first_map(first, this, &matches, pinhole, config) else { return TrackedFrame::lost(times) };
+        self.map = map;
+        self.first_view = None;
+        let keyframes = self.keyframes();
+        let [first, second] = &keyframes[..] else { return TrackedFrame::lost(times) };
+        for keyframe in [first, second] {
+            let (frame_index, timestamp_s, reference) = (keyframe.frame_index, keyframe.timestamp_s, keyframe.id);
+            self.records.push(Record { frame_index, timestamp_s, reference, camera_from_reference: Se3::identity() });
+        }
+        let (id, world_from_camera) = (second.id, second.world_from_camera);
+        self.reference = id;
+        let landmarks = self.map.keyframes[id].landmarks.clone();
+        let inliers = landmarks.iter().flatten().count();
+        self.last = Some(LastFrame { features, camera_from_world: world_from_camera.inverse(), landmarks });
+        TrackedFrame {
+            state: TrackingState::Tracking,
+            world_from_camera: Some(world_from_camera),
+            inliers,
+            keyframe: Some(NewKeyframe { id, world_from_camera, covisible: self.map.covisible(id) }),
+            updates: Vec::new(),
+            times,
+        }
+    }
+}
