@@ -16,7 +16,7 @@ use crate::evaluation::image::WINDOW as SSIM_WINDOW;
 use crate::geometry::{StampedPose, Trajectory};
 use crate::gpu::Gpu;
 use crate::mapping::KeyframeReport;
-use crate::sequence::Sequence;
+use crate::sequence::{Sensor, Sequence};
 use crate::splat::GaussianCloud;
 use crate::tracking::KeyframePose;
 
@@ -53,7 +53,9 @@ impl Outcome {
 /// Says before any work whether a map could be started from this sequence.
 pub fn check_first_depth(sequence: &Sequence) -> Result<(), PipelineError> {
     match sequence.entries.first() {
-        Some(first) if first.depth.is_none() => Err(PipelineError::NoFirstDepth { color: first.color.clone() }),
+        Some(first) if sequence.sensor == Sensor::Rgbd && first.depth.is_none() => {
+            Err(PipelineError::NoFirstDepth { color: first.color.clone() })
+        }
         _ => Ok(()),
     }
 }

@@ -106,13 +106,12 @@ fn hand_on(sender: &mut KeyframeSender<'_>, rectifier: &Rectifier, frame: &Frame
     if !tracked.updates.is_empty() && !sender.send(MapperMessage::PoseUpdate(tracked.updates)) {
         return false;
     }
-    let Some(NewKeyframe { id, world_from_camera, covisible }) = tracked.keyframe else { return true };
-    let keyframe = Keyframe {
-        id,
-        world_from_camera,
-        image: rectifier.rectify(frame),
-        covisible: covisible.into_iter().map(|(id, _)| id).collect(),
-    };
+    let Some(NewKeyframe { id, world_from_camera, seen, covisible }) = tracked.keyframe else { return true };
+    let mut image = rectifier.rectify(frame);
+    if image.depth.is_none() {
+        image.depth = Some(rectifier.sparse_depth(&seen));
+    }
+    let keyframe = Keyframe { id, world_from_camera, image, covisible: covisible.into_iter().map(|(id, _)| id).collect() };
     sender.send(MapperMessage::Keyframe(Box::new(keyframe)))
 }
 

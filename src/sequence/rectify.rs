@@ -24,6 +24,8 @@ pub struct Rectifier {
     /// `[height * width * samples²]` positions in the recorded image, grouped by mapping pixel.
     sources: Vec<[f32; 2]>,
     samples: usize,
+    /// Mapping pixels per recorded pixel along x and y.
+    scale: Vector2<f64>,
 }
 
 impl Rectifier {
@@ -48,7 +50,8 @@ impl Rectifier {
                 }
             }
         }
-        Self { pinhole, sources, samples }
+        let scale = Vector2::new(pinhole.fx / camera.pinhole.fx, pinhole.fy / camera.pinhole.fy);
+        Self { pinhole, sources, samples, scale }
     }
 
     pub fn pinhole(&self) -> Pinhole {
@@ -73,6 +76,22 @@ impl Rectifier {
             metres: self.sources.chunks_exact(group).map(|sources| nearest_surface(depth, sources)).collect(),
         });
         RectifiedImage { pinhole: self.pinhole, color, depth }
+    }
+
+    /// A depth image of a few points alone: pixels of the recorded camera without its distortion, and metres along z.
+    pub fn sparse_depth(&self, points: &[(Vector2<f64>, f64)]) -> DepthImage {
+        let (width, height) = (self.pinhole.width, self.pinhole.height);
+        let mut metres = vec![0.0f32; (width * height) as usize];
+        for (pixel, depth) in points {
+            // Pixel centres stay where they belong when an image is resized.
+            let at = pixel.add_scalar(0.5).component_mul(&self.scale).map(f64::floor);
+            let inside = at.x >= 0.0 && at.y >= 0.0 && at.x < f64::from(width) && at.y < f64::from(height);
+            if inside {
+                let slot = &mut metres[at.y as usize * width as usize + at.x as usize];
+                *slot = if *slot > 0.0 { slot.min(*depth as f32) } else { *depth as f32 };
+            }
+        }
+        DepthImage { width, height, metres }
     }
 }
 

@@ -314,7 +314,7 @@ mod tests {
     #[test]
     fn what_does_not_fit_or_does_not_hold_is_refused() {
         let reference = corner(&Se3::identity());
-        let elsewhere = corner(&se3::exp(&Vector6::new(0.0, 0.0, 0.0, 0.0, 1.2, 0.0)));
+        let elsewhere = corner(&se3::exp(&Vector6::new(0.0, 0.0, 0.0, 0.0, 2.4, 0.0)));
         assert!(align(&reference, &elsewhere, &[Se3::identity()]).is_none());
         // A blank wall says nothing about sliding along it.
         let wall = DenseFrame { depth: vec![2.0; 160 * 120], grey: vec![100.0; 160 * 120], pinhole: PINHOLE.scaled(SCALE) };

@@ -32,6 +32,8 @@ pub use config::TrackingConfig;
 pub use error::TrackingError;
 pub use tracker::Tracker;
 
+use nalgebra::Vector2;
+
 use crate::geometry::{Se3, StampedPose};
 
 /// Whether a frame has a pose.
@@ -64,6 +66,9 @@ pub struct NewKeyframe {
     /// Counts from 0 in the order of creation.
     pub id: usize,
     pub world_from_camera: Se3,
+    /// Where it sees landmarks, and how far along z: pixels of the distortion-free pinhole, metres. For the mapper of a camera without a
+    /// depth image; empty where frames have one.
+    pub seen: Vec<(Vector2<f64>, f64)>,
     /// Other keyframes (id) and how many landmarks they share with this one, strongest first.
     pub covisible: Vec<(usize, usize)>,
 }

@@ -298,7 +298,20 @@ impl Tracker {
         let camera_from_world = pose(id);
         self.reference = id;
         self.last = Some(LastFrame { features, camera_from_world, landmarks: self.map.keyframes[id].landmarks.clone() });
-        (NewKeyframe { id, world_from_camera: camera_from_world.inverse(), covisible: self.map.covisible(id) }, updates)
+        (self.describe(id), updates)
+    }
+
+    /// What the mapper is told of a keyframe.
+    fn describe(&self, id: usize) -> NewKeyframe {
+        let keyframe = &self.map.keyframes[id];
+        let depth = |l: usize| (keyframe.camera_from_world * self.map.landmarks[l].position).z;
+        let pairs = keyframe.features.features.iter().zip(&keyframe.landmarks);
+        let seen = match self.sensor {
+            Sensor::Rgbd => Vec::new(),
+            _ => pairs.filter_map(|(f, l)| l.map(|l| (f.pixel, depth(l)))).filter(|(_, z)| *z > 0.0).collect(),
+        };
+        let world_from_camera = keyframe.camera_from_world.inverse();
+        NewKeyframe { id, world_from_camera, seen, covisible: self.map.covisible(id) }
     }
 
     fn record(&mut self, frame: &Frame, reference: usize, camera_from_reference: Se3) {

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use super::super::frame_features::FrameFeatures;
 use super::super::map::Keyframe;
 use super::super::mono::{self, FirstView};
-use super::super::{NewKeyframe, StageTimes, TrackedFrame, TrackingState, mapping};
+use super::super::{StageTimes, TrackedFrame, TrackingState, mapping};
 use super::{LastFrame, Record, Tracker};
 use crate::geometry::Se3;
 use crate::sequence::Frame;
@@ -32,7 +32,7 @@ impl Tracker {
             state: TrackingState::Tracking,
             world_from_camera: Some(Se3::identity()),
             inliers: with_depth,
-            keyframe: Some(NewKeyframe { id, world_from_camera: Se3::identity(), covisible: Vec::new() }),
+            keyframe: Some(self.describe(id)),
             updates: Vec::new(),
             times,
         }
@@ -74,7 +74,7 @@ impl Tracker {
             state: TrackingState::Tracking,
             world_from_camera: Some(world_from_camera),
             inliers,
-            keyframe: Some(NewKeyframe { id, world_from_camera, covisible: self.map.covisible(id) }),
+            keyframe: Some(self.describe(id)),
             updates: Vec::new(),
             times,
         }
