@@ -3,6 +3,8 @@
 //! Adding a layout takes one file and one row in [`Layout`].
 
 mod cameras;
+mod checks;
+mod colmap;
 mod kitti;
 mod rectify;
 pub mod synthetic;
@@ -11,6 +13,7 @@ mod tum;
 use std::path::{Path, PathBuf};
 
 use image::{GrayImage, RgbImage};
+use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
 use crate::geometry::{Camera, Trajectory, TrajectoryError};
@@ -25,16 +28,19 @@ pub enum Layout {
     Tum,
     /// `image_0` and `image_1` (or `image_2` and `image_3`), `calib.txt`, and perhaps `times.txt` and `poses.txt`.
     Kitti,
+    /// `images` and COLMAP's model of them in `sparse/0`, binary or text: photos whose poses are known.
+    Colmap,
 }
 
 impl Layout {
-    pub const ALL: [Self; 2] = [Self::Tum, Self::Kitti];
+    pub const ALL: [Self; 3] = [Self::Tum, Self::Kitti, Self::Colmap];
 
     /// The layouts with their marker files, for messages.
     fn known() -> String {
         let of = |layout: Self| match layout {
             Self::Tum => "tum: has rgb.txt",
             Self::Kitti => "kitti: has calib.txt and image_0",
+            Self::Colmap => "colmap: has images and sparse/0",
         };
         Self::ALL.map(of).join(", ")
     }
@@ -44,6 +50,7 @@ impl Layout {
         Self::ALL.into_iter().find(|layout| match layout {
             Self::Tum => folder.join("rgb.txt").is_file(),
             Self::Kitti => kitti::recognise(folder),
+            Self::Colmap => colmap::recognise(folder),
         })
     }
 }
@@ -128,6 +135,15 @@ pub struct FrameEntry {
     pub right: Option<PathBuf>,
 }
 
+/// A point of the scene that came with the recording.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct KnownPoint {
+    /// In the world of the known poses, in their unit.
+    pub position: Vector3<f64>,
+    /// sRGB.
+    pub color: [u8; 3],
+}
+
 /// A recording, opened and checked: its camera, the list of its frames, and the truth where there is one.
 #[derive(Clone, Debug)]
 pub struct Sequence {
@@ -137,6 +153,8 @@ pub struct Sequence {
     pub sensor: Sensor,
     pub entries: Vec<FrameEntry>,
     pub groundtruth: Option<Trajectory>,
+    /// Points of the scene in the truth's world, where the recording has them.
+    pub points: Vec<KnownPoint>,
 }
 
 #[derive(Debug, thiserror::Error)]
@@ -151,6 +169,8 @@ pub enum SequenceError {
     Read { path: PathBuf, source: std::io::Error },
     #[error("{path}:{line}: {what}")]
     Syntax { path: PathBuf, line: usize, what: String },
+    #[error("{path}: {what}")]
+    Content { path: PathBuf, what: String },
     #[error("{path} lists no frames; check that the recording was copied whole")]
     Empty { path: PathBuf },
     #[error("{list}:{line}: there is no file {image}; check that the recording was copied whole")]
@@ -182,7 +202,13 @@ impl Sequence {
         match layout {
             Layout::Tum => tum::open(folder, camera),
             Layout::Kitti => kitti::open(folder),
+            Layout::Colmap => colmap::open(folder),
         }
+    }
+
+    /// A recording without truth and known points.
+    fn new(name: String, layout: Layout, camera: Camera, sensor: Sensor, entries: Vec<FrameEntry>) -> Self {
+        Self { name, layout, camera, sensor, entries, groundtruth: None, points: Vec::new() }
     }
 
     /// Takes from the recording only what a sensor of this kind gives: a monocular replay of an RGB-D recording leaves its depth out.
@@ -240,6 +266,19 @@ impl Sequence {
             height,
             metres: raw.into_raw().into_iter().map(|units| f32::from(units) * metres_per_unit).collect(),
         })
+    }
+
+    /// Compares the first images with the camera, so that a wrong calibration is known before any work.
+    fn check_first_size(&self) -> Result<(), SequenceError> {
+        let first = self.entries.first();
+        let paths = first.into_iter().flat_map(|entry| [Some(&entry.color), entry.depth.as_ref(), entry.right.as_ref()]);
+        for path in paths.flatten() {
+            // A first frame that cannot be read at all is met again, and counted, when it is loaded.
+            if let Ok(size) = image::image_dimensions(path) {
+                self.check_size(path, size)?;
+            }
+        }
+        Ok(())
     }
 
     fn check_size(&self, path: &Path, (found_width, found_height): (u32, u32)) -> Result<(), SequenceError> {
