@@ -38,7 +38,7 @@ pub(super) fn open(folder: &Path) -> Result<Sequence, SequenceError> {
         // The fourth column is -fx times the distance from the reference camera.
         let other = calibration.of(right_name, 1)?;
         let baseline_metres = projection[3] / projection[0] - other[3] / other[0];
-        if !(baseline_metres > 0.0) {
+        if baseline_metres <= 0.0 {
             return Err(calibration.wrong("the right camera is not to the right of the left one"));
         }
         Sensor::Stereo { baseline_metres }

@@ -5,12 +5,15 @@
 mod cameras;
 mod checks;
 mod colmap;
+mod euroc;
 mod kitti;
 mod rectify;
+mod stereo;
 pub mod synthetic;
 mod tum;
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use image::{GrayImage, RgbImage};
 use nalgebra::Vector3;
@@ -19,6 +22,7 @@ use serde::{Deserialize, Serialize};
 use crate::geometry::{Camera, Trajectory, TrajectoryError};
 
 pub use rectify::{RectifiedImage, Rectifier};
+use stereo::StereoRemap;
 
 /// How a dataset lays out its files.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
@@ -28,18 +32,21 @@ pub enum Layout {
     Tum,
     /// `image_0` and `image_1` (or `image_2` and `image_3`), `calib.txt`, and perhaps `times.txt` and `poses.txt`.
     Kitti,
+    /// `mav0/cam0` and perhaps `mav0/cam1`, each with `data.csv`, `sensor.yaml` and `data`, as the EuRoC MAV datasets have it.
+    Euroc,
     /// `images` and COLMAP's model of them in `sparse/0`, binary or text: photos whose poses are known.
     Colmap,
 }
 
 impl Layout {
-    pub const ALL: [Self; 3] = [Self::Tum, Self::Kitti, Self::Colmap];
+    pub const ALL: [Self; 4] = [Self::Tum, Self::Kitti, Self::Euroc, Self::Colmap];
 
     /// The layouts with their marker files, for messages.
     fn known() -> String {
         let of = |layout: Self| match layout {
             Self::Tum => "tum: has rgb.txt",
             Self::Kitti => "kitti: has calib.txt and image_0",
+            Self::Euroc => "euroc: has mav0/cam0",
             Self::Colmap => "colmap: has images and sparse/0",
         };
         Self::ALL.map(of).join(", ")
@@ -50,6 +57,7 @@ impl Layout {
         Self::ALL.into_iter().find(|layout| match layout {
             Self::Tum => folder.join("rgb.txt").is_file(),
             Self::Kitti => kitti::recognise(folder),
+            Self::Euroc => euroc::recognise(folder),
             Self::Colmap => colmap::recognise(folder),
         })
     }
@@ -112,7 +120,7 @@ impl DepthImage {
     }
 }
 
-/// One recorded frame as it was recorded: not undistorted, at full size.
+/// One recorded frame as it was recorded, at full size: not undistorted, but for raw stereo pairs, which are rectified.
 #[derive(Clone, Debug)]
 pub struct Frame {
     /// Position in the sequence as replayed (after `--every` and `--frames`).
@@ -155,6 +163,8 @@ pub struct Sequence {
     pub groundtruth: Option<Trajectory>,
     /// Points of the scene in the truth's world, where the recording has them.
     pub points: Vec<KnownPoint>,
+    /// Turns raw stereo pairs into those that `camera` and `sensor` describe, when they are loaded.
+    remap: Option<Arc<StereoRemap>>,
 }
 
 #[derive(Debug, thiserror::Error)]
@@ -202,13 +212,14 @@ impl Sequence {
         match layout {
             Layout::Tum => tum::open(folder, camera),
             Layout::Kitti => kitti::open(folder),
+            Layout::Euroc => euroc::open(folder),
             Layout::Colmap => colmap::open(folder),
         }
     }
 
     /// A recording without truth and known points.
     fn new(name: String, layout: Layout, camera: Camera, sensor: Sensor, entries: Vec<FrameEntry>) -> Self {
-        Self { name, layout, camera, sensor, entries, groundtruth: None, points: Vec::new() }
+        Self { name, layout, camera, sensor, entries, groundtruth: None, points: Vec::new(), remap: None }
     }
 
     /// Takes from the recording only what a sensor of this kind gives: a monocular replay of an RGB-D recording leaves its depth out.
@@ -241,8 +252,12 @@ impl Sequence {
     /// Decodes frame `index`.
     pub fn load(&self, index: usize) -> Result<Frame, SequenceError> {
         let entry = &self.entries[index];
-        let color = decode(&entry.color)?.into_rgb8();
-        self.check_size(&entry.color, color.dimensions())?;
+        let color = decode(&entry.color)?;
+        self.check_size(&entry.color, (color.width(), color.height()))?;
+        let color = match &self.remap {
+            Some(remap) => remap.left(color),
+            None => color.into_rgb8(),
+        };
         let depth = entry.depth.as_deref().map(|path| self.load_depth(path)).transpose()?;
         let right = entry.right.as_deref().map(|path| self.load_right(path)).transpose()?;
         Ok(Frame { index, timestamp_s: entry.timestamp_s, color, depth, right })
@@ -251,7 +266,10 @@ impl Sequence {
     fn load_right(&self, path: &Path) -> Result<GrayImage, SequenceError> {
         let image = decode(path)?.into_luma8();
         self.check_size(path, image.dimensions())?;
-        Ok(image)
+        Ok(match &self.remap {
+            Some(remap) => remap.right(&image),
+            None => image,
+        })
     }
 
     fn load_depth(&self, path: &Path) -> Result<DepthImage, SequenceError> {

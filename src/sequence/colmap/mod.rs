@@ -14,7 +14,7 @@ mod tests;
 
 use std::path::{Path, PathBuf};
 
-use super::{FrameEntry, KnownPoint, Layout, Sensor, Sequence, SequenceError, checks, folder_name};
+use super::{FrameEntry, Layout, Sensor, Sequence, SequenceError, checks, folder_name};
 use crate::geometry::{Camera, Distortion, Pinhole, Se3, StampedPose, Trajectory};
 
 /// COLMAP's camera models in the order of their numbers, with how many parameters each has.

@@ -1,6 +1,7 @@
 use nalgebra::{Point3, Vector2, Vector3};
 
 use super::*;
+use crate::sequence::KnownPoint;
 
 const CAMERAS: &str = "# Camera list\n7 OPENCV 8 6 10 11 4.0 3.0 0.1 -0.2 0.003 0.004\n";
 /// Not in the order of names, and with an image that observes nothing.
