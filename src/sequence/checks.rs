@@ -28,6 +28,14 @@ pub fn side(pixels: u64) -> Option<u32> {
     u32::try_from(pixels).ok().filter(|side| (1..=MAX_SIDE).contains(side))
 }
 
+/// So many finite numbers, and nothing else.
+pub fn numbers(text: &str, count: usize) -> Result<Vec<f64>, String> {
+    let finite = |field: &str| field.parse().ok().filter(|v: &f64| v.is_finite());
+    let numbers: Option<Vec<f64>> = text.split_whitespace().map(finite).collect();
+    let of_that_count = numbers.filter(|numbers| numbers.len() == count);
+    of_that_count.ok_or_else(|| format!("expected {count} finite numbers, not `{}`", text.trim()))
+}
+
 /// The rigid motion whose 3×4 matrix the first twelve numbers are, row-major, metres.
 pub fn rigid(m: &[f64]) -> Result<Se3, String> {
     if m.len() < 12 || m.iter().any(|v| !v.is_finite()) {

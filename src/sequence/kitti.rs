@@ -73,7 +73,7 @@ impl Calibration {
             if name.as_deref().is_some_and(|name| !name.starts_with('P')) {
                 continue;
             }
-            projections.push((name, read_row(numbers).map_err(|what| syntax(path, index, what))?));
+            projections.push((name, checks::numbers(numbers, 12).map_err(|what| syntax(path, index, what))?));
         }
         Ok(Self { path: path.into(), projections })
     }
@@ -97,17 +97,6 @@ impl Calibration {
 
 fn syntax(path: &Path, index: usize, what: String) -> SequenceError {
     SequenceError::Syntax { path: path.into(), line: index + 1, what }
-}
-
-/// Twelve finite numbers.
-fn read_row(text: &str) -> Result<Vec<f64>, String> {
-    let numbers: Vec<f64> = text.split_whitespace().map_while(|n| n.parse().ok()).filter(|v: &f64| v.is_finite()).collect();
-    let fields = text.split_whitespace().count();
-    if numbers.len() == 12 && fields == 12 {
-        Ok(numbers)
-    } else {
-        Err(format!("expected 12 finite numbers, not `{}`", text.trim()))
-    }
 }
 
 fn read_times(path: &Path, frames: usize) -> Result<Vec<f64>, SequenceError> {
@@ -138,7 +127,7 @@ fn read_poses(path: &Path, times: &[f64]) -> Result<Trajectory, SequenceError> {
     let mut poses = Vec::new();
     let text = read_text(path)?;
     for ((index, line), &timestamp_s) in text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty()).zip(times) {
-        let m = read_row(line).map_err(|what| syntax(path, index, what))?;
+        let m = checks::numbers(line, 12).map_err(|what| syntax(path, index, what))?;
         let world_from_camera = checks::rigid(&m).map_err(|what| syntax(path, index, what))?;
         poses.push(StampedPose { timestamp_s, world_from_camera });
     }

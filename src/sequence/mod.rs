@@ -6,10 +6,13 @@ mod cameras;
 mod checks;
 mod colmap;
 mod euroc;
+mod images;
 mod kitti;
 mod rectify;
+mod replica;
 mod stereo;
 pub mod synthetic;
+mod transforms;
 mod tum;
 
 use std::path::{Path, PathBuf};
@@ -36,10 +39,16 @@ pub enum Layout {
     Euroc,
     /// `images` and COLMAP's model of them in `sparse/0`, binary or text: photos whose poses are known.
     Colmap,
+    /// `results/frame*.jpg` and `results/depth*.png`, `traj.txt`, and `cam_params.json` there or one folder up: Replica by NICE-SLAM.
+    Replica,
+    /// `transforms.json`, as NeRF's data, instant-ngp and nerfstudio have it: photos whose poses are known.
+    Transforms,
+    /// `camera.toml` and images in the folder itself, in `rgb` and perhaps `depth`, or in `left` and `right`.
+    Images,
 }
 
 impl Layout {
-    pub const ALL: [Self; 4] = [Self::Tum, Self::Kitti, Self::Euroc, Self::Colmap];
+    pub const ALL: [Self; 7] = [Self::Tum, Self::Kitti, Self::Euroc, Self::Colmap, Self::Replica, Self::Transforms, Self::Images];
 
     /// The layouts with their marker files, for messages.
     fn known() -> String {
@@ -48,6 +57,9 @@ impl Layout {
             Self::Kitti => "kitti: has calib.txt and image_0",
             Self::Euroc => "euroc: has mav0/cam0",
             Self::Colmap => "colmap: has images and sparse/0",
+            Self::Replica => "replica: has traj.txt and results",
+            Self::Transforms => "transforms: has transforms.json",
+            Self::Images => "images: has camera.toml",
         };
         Self::ALL.map(of).join(", ")
     }
@@ -59,6 +71,9 @@ impl Layout {
             Self::Kitti => kitti::recognise(folder),
             Self::Euroc => euroc::recognise(folder),
             Self::Colmap => colmap::recognise(folder),
+            Self::Replica => replica::recognise(folder),
+            Self::Transforms => transforms::recognise(folder),
+            Self::Images => images::recognise(folder),
         })
     }
 }
@@ -203,7 +218,7 @@ pub enum SequenceError {
 
 impl Sequence {
     /// Opens a recording: finds its layout unless named, reads and checks its lists, camera and truth. No image is decoded.
-    /// `camera` names a preset (`tum-fr1`, …) to use instead of what the folder says.
+    /// `camera` names a preset (`tum-fr1`, …) to use instead of what a folder in TUM's layout says.
     pub fn open(folder: &Path, layout: Option<Layout>, camera: Option<&str>) -> Result<Self, SequenceError> {
         if !folder.is_dir() {
             return Err(SequenceError::Missing(folder.into()));
@@ -214,6 +229,9 @@ impl Sequence {
             Layout::Kitti => kitti::open(folder),
             Layout::Euroc => euroc::open(folder),
             Layout::Colmap => colmap::open(folder),
+            Layout::Replica => replica::open(folder),
+            Layout::Transforms => transforms::open(folder),
+            Layout::Images => images::open(folder),
         }
     }
 
@@ -317,6 +335,14 @@ fn folder_name(folder: &Path) -> String {
 
 fn read_text(path: &Path) -> Result<String, SequenceError> {
     std::fs::read_to_string(path).map_err(|source| SequenceError::Read { path: path.into(), source })
+}
+
+fn read_json<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T, SequenceError> {
+    serde_json::from_str(&read_text(path)?).map_err(|error| SequenceError::Syntax {
+        path: path.into(),
+        line: error.line(),
+        what: error.to_string(),
+    })
 }
 
 /// The pictures in a folder, by name.
