@@ -9,6 +9,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use nalgebra::UnitQuaternion;
 use serde::Deserialize;
 
 use super::{FrameEntry, Layout, Sensor, Sequence, SequenceError, checks, folder_name, read_text, stereo};
@@ -24,37 +25,42 @@ pub(super) fn recognise(folder: &Path) -> bool {
 pub(super) fn open(folder: &Path) -> Result<Sequence, SequenceError> {
     let (left, right) = (folder.join("mav0/cam0"), folder.join("mav0/cam1"));
     let lefts = read_list(&left)?;
-    let (mut camera, mut body_from_camera) = read_sensor(&left.join("sensor.yaml"))?;
-    let (mut sensor, mut remap, mut rights) = (Sensor::Mono, None, Vec::new());
-    if right.join("data.csv").is_file() {
-        let path = right.join("sensor.yaml");
-        let (right_camera, body_from_right) = read_sensor(&path)?;
-        let pair = stereo::rectify(&camera, &right_camera, &(body_from_camera.inverse() * body_from_right))
-            .map_err(|what| SequenceError::Content { path, what })?;
-        camera = Camera { pinhole: pair.pinhole, distortion: Distortion::default(), ..camera };
-        body_from_camera *= pair.rectified_from_left.inverse();
-        sensor = Sensor::Stereo { baseline_metres: pair.baseline_metres };
-        remap = Some(Arc::new(pair.remap));
-        rights = read_list(&right)?;
+    let has_right = right.join("data.csv").is_file();
+    let rights = if has_right { read_list(&right)? } else { Vec::new() };
+    let (camera, mut body_from_camera) = read_sensor(&left.join("sensor.yaml"))?;
+    let entry = |left: ListedImage| FrameEntry {
+        timestamp_s: seconds(left.timestamp_ns),
+        right: nearest(&rights, left.timestamp_ns),
+        color: left.path,
+        depth: None,
+    };
+    let entries = lefts.into_iter().map(entry).collect();
+    let mut sequence = Sequence::new(folder_name(folder), Layout::Euroc, camera, Sensor::Mono, entries);
+    // Before the maps are made, which are as large as the calibration says.
+    sequence.check_first_size()?;
+    if has_right {
+        let rectified_from_left = rectify(&mut sequence, &right, &body_from_camera)?;
+        body_from_camera *= rectified_from_left.inverse();
     }
-    let entries: Vec<FrameEntry> = lefts
-        .into_iter()
-        .map(|left| FrameEntry {
-            timestamp_s: seconds(left.timestamp_ns),
-            right: nearest(&rights, left.timestamp_ns),
-            color: left.path,
-            depth: None,
-        })
-        .collect();
-    if !rights.is_empty() && entries.iter().all(|entry| entry.right.is_none()) {
+    let truth = folder.join("mav0/state_groundtruth_estimate0/data.csv");
+    sequence.groundtruth = truth.is_file().then(|| read_truth(&truth, &body_from_camera)).transpose()?;
+    Ok(sequence)
+}
+
+/// Makes the recording one of rectified pairs; says how its left camera is turned for that.
+fn rectify(sequence: &mut Sequence, right: &Path, body_from_left: &Se3) -> Result<UnitQuaternion<f64>, SequenceError> {
+    if sequence.entries.iter().all(|entry| entry.right.is_none()) {
         let what = "no image has the time of one of cam0, to a millisecond; are the two of one recording?".into();
         return Err(SequenceError::Content { path: right.join("data.csv"), what });
     }
-    let truth = folder.join("mav0/state_groundtruth_estimate0/data.csv");
-    let groundtruth = truth.is_file().then(|| read_truth(&truth, &body_from_camera)).transpose()?;
-    let sequence = Sequence { groundtruth, remap, ..Sequence::new(folder_name(folder), Layout::Euroc, camera, sensor, entries) };
-    sequence.check_first_size()?;
-    Ok(sequence)
+    let path = right.join("sensor.yaml");
+    let (right_camera, body_from_right) = read_sensor(&path)?;
+    let pair = stereo::rectify(&sequence.camera, &right_camera, &(body_from_left.inverse() * body_from_right))
+        .map_err(|what| SequenceError::Content { path, what })?;
+    sequence.camera = Camera { pinhole: pair.pinhole, distortion: Distortion::default(), ..sequence.camera };
+    sequence.sensor = Sensor::Stereo { baseline_metres: pair.baseline_metres };
+    sequence.remap = Some(Arc::new(pair.remap));
+    Ok(pair.rectified_from_left)
 }
 
 /// A camera's calibration file, as far as we need it.
@@ -311,7 +317,8 @@ mod tests {
         refused(spoil("cam0/sensor.yaml", "radial-tangential", "equidistant"), "equidistant lenses");
         refused(spoil("cam0/sensor.yaml", "intrinsics: [458.654", "intrinsics: [x"), "cam0/sensor.yaml:14: ");
         refused(spoil("cam0/sensor.yaml", "intrinsics", "extrinsics"), "sensor.yaml");
-        refused(spoil("cam0/sensor.yaml", "[752, 480]", "[480, 480]"), "different sizes");
+        refused(spoil("cam0/sensor.yaml", "[752, 480]", "[60000, 60000]"), "is 752x480, but the camera is 60000x60000");
+        refused(spoil("cam1/sensor.yaml", "[752, 480]", "[480, 480]"), "different sizes");
         refused(spoil("cam1/sensor.yaml", "0.0125552670891", "0.5"), "T_BS: the first three columns are no rotation");
         refused(spoil("cam1/sensor.yaml", "0.0453689425024", "-0.1453689425024"), "not to the right");
         refused(spoil("state_groundtruth_estimate0/data.csv", "3.5,1,0,0,0,0,0,0", "3.5,1"), "data.csv:3: expected `timestamp");
