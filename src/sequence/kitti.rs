@@ -6,10 +6,8 @@
 
 use std::path::{Path, PathBuf};
 
-use nalgebra::{Matrix3, Rotation3, Translation3, UnitQuaternion, Vector3};
-
-use super::{FrameEntry, Layout, Sensor, Sequence, SequenceError, folder_name, images_in, read_text};
-use crate::geometry::{Camera, Distortion, Pinhole, Se3, StampedPose, Trajectory};
+use super::{FrameEntry, Layout, Sensor, Sequence, SequenceError, checks, folder_name, images_in, read_text};
+use crate::geometry::{Camera, Distortion, Pinhole, StampedPose, Trajectory};
 
 const FRAME_S: f64 = 0.1;
 /// Folder of the left and of the right images, and their cameras in a calibration that names them.
@@ -54,7 +52,7 @@ pub(super) fn open(folder: &Path) -> Result<Sequence, SequenceError> {
         .collect();
     let groundtruth = truth_file(folder).map(|path| read_poses(&path, &times)).transpose()?;
     let camera = Camera { pinhole, distortion: Distortion::default(), depth_units_per_metre: 1.0 };
-    Ok(Sequence { name: folder_name(folder), layout: Layout::Kitti, camera, sensor, entries, groundtruth })
+    Ok(Sequence { groundtruth, ..Sequence::new(folder_name(folder), Layout::Kitti, camera, sensor, entries) })
 }
 
 /// The projections of a calibration file, each with its name where it has one.
@@ -76,7 +74,7 @@ impl Calibration {
             if name.as_deref().is_some_and(|name| !name.starts_with('P')) {
                 continue;
             }
-            projections.push((name, read_row(numbers).map_err(|what| syntax(path, index, what))?));
+            projections.push((name, checks::numbers(numbers, 12).map_err(|what| syntax(path, index, what))?));
         }
         Ok(Self { path: path.into(), projections })
     }
@@ -100,17 +98,6 @@ impl Calibration {
 
 fn syntax(path: &Path, index: usize, what: String) -> SequenceError {
     SequenceError::Syntax { path: path.into(), line: index + 1, what }
-}
-
-/// Twelve finite numbers.
-fn read_row(text: &str) -> Result<Vec<f64>, String> {
-    let numbers: Vec<f64> = text.split_whitespace().map_while(|n| n.parse().ok()).filter(|v: &f64| v.is_finite()).collect();
-    let fields = text.split_whitespace().count();
-    if numbers.len() == 12 && fields == 12 {
-        Ok(numbers)
-    } else {
-        Err(format!("expected 12 finite numbers, not `{}`", text.trim()))
-    }
 }
 
 fn read_times(path: &Path, frames: usize) -> Result<Vec<f64>, SequenceError> {
@@ -141,13 +128,8 @@ fn read_poses(path: &Path, times: &[f64]) -> Result<Trajectory, SequenceError> {
     let mut poses = Vec::new();
     let text = read_text(path)?;
     for ((index, line), &timestamp_s) in text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty()).zip(times) {
-        let m = read_row(line).map_err(|what| syntax(path, index, what))?;
-        let rotation = Matrix3::new(m[0], m[1], m[2], m[4], m[5], m[6], m[8], m[9], m[10]);
-        let nearest = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix(&rotation));
-        if (nearest.to_rotation_matrix().matrix() - rotation).norm() > 1e-2 {
-            return Err(syntax(path, index, "the first three columns are no rotation".into()));
-        }
-        let world_from_camera = Se3::from_parts(Translation3::from(Vector3::new(m[3], m[7], m[11])), nearest);
+        let m = checks::numbers(line, 12).map_err(|what| syntax(path, index, what))?;
+        let world_from_camera = checks::rigid(&m).map_err(|what| syntax(path, index, what))?;
         poses.push(StampedPose { timestamp_s, world_from_camera });
     }
     Ok(Trajectory { poses })

@@ -3,19 +3,29 @@
 //! Adding a layout takes one file and one row in [`Layout`].
 
 mod cameras;
+mod checks;
+mod colmap;
+mod euroc;
+mod images;
 mod kitti;
 mod rectify;
+mod replica;
+mod stereo;
 pub mod synthetic;
+mod transforms;
 mod tum;
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use image::{GrayImage, RgbImage};
+use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
 use crate::geometry::{Camera, Trajectory, TrajectoryError};
 
 pub use rectify::{RectifiedImage, Rectifier};
+use stereo::StereoRemap;
 
 /// How a dataset lays out its files.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
@@ -25,16 +35,31 @@ pub enum Layout {
     Tum,
     /// `image_0` and `image_1` (or `image_2` and `image_3`), `calib.txt`, and perhaps `times.txt` and `poses.txt`.
     Kitti,
+    /// `mav0/cam0` and perhaps `mav0/cam1`, each with `data.csv`, `sensor.yaml` and `data`, as the EuRoC MAV datasets have it.
+    Euroc,
+    /// `images` and COLMAP's model of them in `sparse/0`, binary or text: photos whose poses are known.
+    Colmap,
+    /// `results/frame*.jpg` and `results/depth*.png`, `traj.txt`, and `cam_params.json` there or one folder up: Replica by NICE-SLAM.
+    Replica,
+    /// `transforms.json`, as NeRF's data, instant-ngp and nerfstudio have it: photos whose poses are known.
+    Transforms,
+    /// `camera.toml` and images in the folder itself, in `rgb` and perhaps `depth`, or in `left` and `right`.
+    Images,
 }
 
 impl Layout {
-    pub const ALL: [Self; 2] = [Self::Tum, Self::Kitti];
+    pub const ALL: [Self; 7] = [Self::Tum, Self::Kitti, Self::Euroc, Self::Colmap, Self::Replica, Self::Transforms, Self::Images];
 
     /// The layouts with their marker files, for messages.
     fn known() -> String {
         let of = |layout: Self| match layout {
             Self::Tum => "tum: has rgb.txt",
             Self::Kitti => "kitti: has calib.txt and image_0",
+            Self::Euroc => "euroc: has mav0/cam0",
+            Self::Colmap => "colmap: has images and sparse/0",
+            Self::Replica => "replica: has traj.txt and results",
+            Self::Transforms => "transforms: has transforms.json",
+            Self::Images => "images: has camera.toml",
         };
         Self::ALL.map(of).join(", ")
     }
@@ -44,6 +69,11 @@ impl Layout {
         Self::ALL.into_iter().find(|layout| match layout {
             Self::Tum => folder.join("rgb.txt").is_file(),
             Self::Kitti => kitti::recognise(folder),
+            Self::Euroc => euroc::recognise(folder),
+            Self::Colmap => colmap::recognise(folder),
+            Self::Replica => replica::recognise(folder),
+            Self::Transforms => transforms::recognise(folder),
+            Self::Images => images::recognise(folder),
         })
     }
 }
@@ -105,7 +135,7 @@ impl DepthImage {
     }
 }
 
-/// One recorded frame as it was recorded: not undistorted, at full size.
+/// One recorded frame as it was recorded, at full size: not undistorted, but for raw stereo pairs, which are rectified.
 #[derive(Clone, Debug)]
 pub struct Frame {
     /// Position in the sequence as replayed (after `--every` and `--frames`).
@@ -128,6 +158,15 @@ pub struct FrameEntry {
     pub right: Option<PathBuf>,
 }
 
+/// A point of the scene that came with the recording.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct KnownPoint {
+    /// In the world of the known poses, in their unit.
+    pub position: Vector3<f64>,
+    /// sRGB.
+    pub color: [u8; 3],
+}
+
 /// A recording, opened and checked: its camera, the list of its frames, and the truth where there is one.
 #[derive(Clone, Debug)]
 pub struct Sequence {
@@ -137,6 +176,10 @@ pub struct Sequence {
     pub sensor: Sensor,
     pub entries: Vec<FrameEntry>,
     pub groundtruth: Option<Trajectory>,
+    /// Points of the scene in the truth's world, where the recording has them.
+    pub points: Vec<KnownPoint>,
+    /// Turns raw stereo pairs into those that `camera` and `sensor` describe, when they are loaded.
+    remap: Option<Arc<StereoRemap>>,
 }
 
 #[derive(Debug, thiserror::Error)]
@@ -151,6 +194,8 @@ pub enum SequenceError {
     Read { path: PathBuf, source: std::io::Error },
     #[error("{path}:{line}: {what}")]
     Syntax { path: PathBuf, line: usize, what: String },
+    #[error("{path}: {what}")]
+    Content { path: PathBuf, what: String },
     #[error("{path} lists no frames; check that the recording was copied whole")]
     Empty { path: PathBuf },
     #[error("{list}:{line}: there is no file {image}; check that the recording was copied whole")]
@@ -173,7 +218,7 @@ pub enum SequenceError {
 
 impl Sequence {
     /// Opens a recording: finds its layout unless named, reads and checks its lists, camera and truth. No image is decoded.
-    /// `camera` names a preset (`tum-fr1`, …) to use instead of what the folder says.
+    /// `camera` names a preset (`tum-fr1`, …) to use instead of what a folder in TUM's layout says.
     pub fn open(folder: &Path, layout: Option<Layout>, camera: Option<&str>) -> Result<Self, SequenceError> {
         if !folder.is_dir() {
             return Err(SequenceError::Missing(folder.into()));
@@ -182,7 +227,17 @@ impl Sequence {
         match layout {
             Layout::Tum => tum::open(folder, camera),
             Layout::Kitti => kitti::open(folder),
+            Layout::Euroc => euroc::open(folder),
+            Layout::Colmap => colmap::open(folder),
+            Layout::Replica => replica::open(folder),
+            Layout::Transforms => transforms::open(folder),
+            Layout::Images => images::open(folder),
         }
+    }
+
+    /// A recording without truth and known points.
+    fn new(name: String, layout: Layout, camera: Camera, sensor: Sensor, entries: Vec<FrameEntry>) -> Self {
+        Self { name, layout, camera, sensor, entries, groundtruth: None, points: Vec::new(), remap: None }
     }
 
     /// Takes from the recording only what a sensor of this kind gives: a monocular replay of an RGB-D recording leaves its depth out.
@@ -215,8 +270,12 @@ impl Sequence {
     /// Decodes frame `index`.
     pub fn load(&self, index: usize) -> Result<Frame, SequenceError> {
         let entry = &self.entries[index];
-        let color = decode(&entry.color)?.into_rgb8();
-        self.check_size(&entry.color, color.dimensions())?;
+        let color = decode(&entry.color)?;
+        self.check_size(&entry.color, (color.width(), color.height()))?;
+        let color = match &self.remap {
+            Some(remap) => remap.left(color),
+            None => color.into_rgb8(),
+        };
         let depth = entry.depth.as_deref().map(|path| self.load_depth(path)).transpose()?;
         let right = entry.right.as_deref().map(|path| self.load_right(path)).transpose()?;
         Ok(Frame { index, timestamp_s: entry.timestamp_s, color, depth, right })
@@ -225,7 +284,10 @@ impl Sequence {
     fn load_right(&self, path: &Path) -> Result<GrayImage, SequenceError> {
         let image = decode(path)?.into_luma8();
         self.check_size(path, image.dimensions())?;
-        Ok(image)
+        Ok(match &self.remap {
+            Some(remap) => remap.right(&image),
+            None => image,
+        })
     }
 
     fn load_depth(&self, path: &Path) -> Result<DepthImage, SequenceError> {
@@ -240,6 +302,19 @@ impl Sequence {
             height,
             metres: raw.into_raw().into_iter().map(|units| f32::from(units) * metres_per_unit).collect(),
         })
+    }
+
+    /// Compares the first images with the camera, so that a wrong calibration is known before any work.
+    fn check_first_size(&self) -> Result<(), SequenceError> {
+        let first = self.entries.first();
+        let paths = first.into_iter().flat_map(|entry| [Some(&entry.color), entry.depth.as_ref(), entry.right.as_ref()]);
+        for path in paths.flatten() {
+            // A first frame that cannot be read at all is met again, and counted, when it is loaded.
+            if let Ok(size) = image::image_dimensions(path) {
+                self.check_size(path, size)?;
+            }
+        }
+        Ok(())
     }
 
     fn check_size(&self, path: &Path, (found_width, found_height): (u32, u32)) -> Result<(), SequenceError> {
@@ -260,6 +335,14 @@ fn folder_name(folder: &Path) -> String {
 
 fn read_text(path: &Path) -> Result<String, SequenceError> {
     std::fs::read_to_string(path).map_err(|source| SequenceError::Read { path: path.into(), source })
+}
+
+fn read_json<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T, SequenceError> {
+    serde_json::from_str(&read_text(path)?).map_err(|error| SequenceError::Syntax {
+        path: path.into(),
+        line: error.line(),
+        what: error.to_string(),
+    })
 }
 
 /// The pictures in a folder, by name.

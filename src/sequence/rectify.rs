@@ -1,6 +1,6 @@
 //! Frames as the mapper wants them: without lens distortion, at the mapping resolution.
 
-use image::{Rgb, RgbImage};
+use image::{ImageBuffer, Pixel, Rgb, RgbImage};
 use nalgebra::Vector2;
 
 use super::{DepthImage, Frame};
@@ -65,7 +65,7 @@ impl Rectifier {
         for (pixel, sources) in color.pixels_mut().zip(self.sources.chunks_exact(group)) {
             let mut sum = [0.0f32; 3];
             for source in sources {
-                let value = bilinear(&frame.color, *source);
+                let value: [f32; 3] = bilinear(&frame.color, *source);
                 (0..3).for_each(|c| sum[c] += value[c]);
             }
             *pixel = Rgb(sum.map(|v| (v / group as f32 + 0.5) as u8));
@@ -95,12 +95,13 @@ impl Rectifier {
     }
 }
 
-fn bilinear(image: &RgbImage, [x, y]: [f32; 2]) -> [f32; 3] {
+/// The `C` channels at a position in pixels; beyond the border its values go on.
+pub(super) fn bilinear<P: Pixel<Subpixel = u8>, const C: usize>(image: &ImageBuffer<P, Vec<u8>>, [x, y]: [f32; 2]) -> [f32; C] {
     let (x, y) = (x.clamp(0.0, image.width() as f32 - 1.0), y.clamp(0.0, image.height() as f32 - 1.0));
     let (x0, y0) = (x as u32, y as u32);
     let (x1, y1) = ((x0 + 1).min(image.width() - 1), (y0 + 1).min(image.height() - 1));
     let (u, v) = (x - x0 as f32, y - y0 as f32);
-    let at = |x, y, c: usize| f32::from(image.get_pixel(x, y).0[c]);
+    let at = |x, y, c: usize| f32::from(image.get_pixel(x, y).channels()[c]);
     std::array::from_fn(|c| {
         (at(x0, y0, c) * (1.0 - u) + at(x1, y0, c) * u) * (1.0 - v) + (at(x0, y1, c) * (1.0 - u) + at(x1, y1, c) * u) * v
     })

@@ -30,13 +30,8 @@ pub(super) fn open(folder: &Path, camera: Option<&str>) -> Result<Sequence, Sequ
     let sensor = if entries.iter().any(|entry| entry.depth.is_some()) { Sensor::Rgbd } else { Sensor::Mono };
     let groundtruth = folder.join("groundtruth.txt");
     let groundtruth = groundtruth.is_file().then(|| Trajectory::read_tum(&groundtruth)).transpose()?;
-    let sequence = Sequence { name, layout: Layout::Tum, camera, sensor, entries, groundtruth };
-    for path in [Some(&sequence.entries[0].color), sequence.entries[0].depth.as_ref()].into_iter().flatten() {
-        // A first frame that cannot be read at all is met again, and counted, when it is loaded.
-        if let Ok(size) = image::image_dimensions(path) {
-            sequence.check_size(path, size)?;
-        }
-    }
+    let sequence = Sequence { groundtruth, ..Sequence::new(name, Layout::Tum, camera, sensor, entries) };
+    sequence.check_first_size()?;
     Ok(sequence)
 }
 

@@ -1,0 +1,142 @@
+//! Photos with a sparse model by COLMAP (Schönberger & Frahm, *Structure-from-Motion Revisited*, CVPR 2016).
+//!
+//! `images/` beside `sparse/0/` (or `sparse/`) with `cameras`, `images` and `points3D`, each `.bin` or `.txt`. The poses are known: they
+//! become the truth, and the points with their colours seed a map. Photos have no times: sorted by name, the n-th has the timestamp of
+//! n seconds. COLMAP's pixels count from the image's corner, ours from the first pixel's centre: principal points move by half a pixel.
+//!
+//! Left out: models of several cameras, and fisheye lenses; both are refused.
+
+mod binary;
+mod text;
+
+#[cfg(test)]
+mod tests;
+
+use std::path::{Path, PathBuf};
+
+use super::{FrameEntry, Layout, Sensor, Sequence, SequenceError, checks, folder_name};
+use crate::geometry::{Camera, Distortion, Pinhole, Se3, StampedPose, Trajectory};
+
+/// COLMAP's camera models in the order of their numbers, with how many parameters each has.
+const MODELS: [(&str, usize); 11] = [
+    ("SIMPLE_PINHOLE", 3),
+    ("PINHOLE", 4),
+    ("SIMPLE_RADIAL", 4),
+    ("RADIAL", 5),
+    ("OPENCV", 8),
+    ("OPENCV_FISHEYE", 8),
+    ("FULL_OPENCV", 12),
+    ("FOV", 5),
+    ("SIMPLE_RADIAL_FISHEYE", 4),
+    ("RADIAL_FISHEYE", 5),
+    ("THIN_PRISM_FISHEYE", 12),
+];
+
+/// A camera as the model has it.
+struct ModelCamera {
+    id: u32,
+    model: String,
+    width: u64,
+    height: u64,
+    parameters: Vec<f64>,
+}
+
+/// A photo and where it was taken.
+struct KnownImage {
+    /// Path below `images/`.
+    name: String,
+    /// The number of its camera.
+    camera: u32,
+    camera_from_world: Se3,
+}
+
+/// The folder of the model, where there is one.
+fn model_folder(folder: &Path) -> Option<PathBuf> {
+    let has_cameras = |model: &PathBuf| ["cameras.bin", "cameras.txt"].iter().any(|name| model.join(name).is_file());
+    ["sparse/0", "sparse"].map(|model| folder.join(model)).into_iter().find(has_cameras)
+}
+
+pub(super) fn recognise(folder: &Path) -> bool {
+    folder.join("images").is_dir() && model_folder(folder).is_some()
+}
+
+pub(super) fn open(folder: &Path) -> Result<Sequence, SequenceError> {
+    let model = model_folder(folder).ok_or_else(|| SequenceError::Missing(folder.join("sparse/0")))?;
+    let (cameras, cameras_path) = read(&model, "cameras", binary::cameras, text::cameras)?;
+    let (mut images, images_path) = read(&model, "images", binary::images, text::images)?;
+    // A model without points is one without a seed.
+    let has_points = ["points3D.bin", "points3D.txt"].iter().any(|name| model.join(name).is_file());
+    let points = if has_points { read(&model, "points3D", binary::points, text::points)?.0 } else { Vec::new() };
+    images.sort_by(|a, b| a.name.cmp(&b.name));
+    let first = images.first().ok_or_else(|| SequenceError::Empty { path: images_path.clone() })?;
+    if let Some(other) = images.iter().find(|image| image.camera != first.camera) {
+        let (a, b) = (&first.name, &other.name);
+        let what = format!("{a} and {b} have different cameras; a recording needs one, as COLMAP makes with single_camera");
+        return Err(SequenceError::Content { path: images_path, what });
+    }
+    let camera = cameras
+        .iter()
+        .find(|camera| camera.id == first.camera)
+        .ok_or_else(|| format!("there is no camera {}, which the images have", first.camera))
+        .and_then(camera_of)
+        .map_err(|what| SequenceError::Content { path: cameras_path, what })?;
+    let entry = |(index, image): (usize, &KnownImage)| {
+        let color = folder.join("images").join(&image.name);
+        if !color.is_file() {
+            let what = format!("there is no photo {}; check that the recording was copied whole", color.display());
+            return Err(SequenceError::Content { path: images_path.clone(), what });
+        }
+        Ok(FrameEntry { timestamp_s: index as f64, color, depth: None, right: None })
+    };
+    let entries = images.iter().enumerate().map(entry).collect::<Result<Vec<_>, _>>()?;
+    let stamped = |(index, image): (usize, &KnownImage)| StampedPose {
+        timestamp_s: index as f64,
+        world_from_camera: image.camera_from_world.inverse(),
+    };
+    let groundtruth = Trajectory { poses: images.iter().enumerate().map(stamped).collect() };
+    let sequence = Sequence {
+        points,
+        groundtruth: Some(groundtruth),
+        ..Sequence::new(folder_name(folder), Layout::Colmap, camera, Sensor::Mono, entries)
+    };
+    sequence.check_first_size()?;
+    Ok(sequence)
+}
+
+/// Reads one part of the model from the form that it has; the binary one goes first, as COLMAP's tools do it.
+fn read<T>(
+    model: &Path,
+    part: &str,
+    binary: impl Fn(&Path) -> Result<T, SequenceError>,
+    text: impl Fn(&Path) -> Result<T, SequenceError>,
+) -> Result<(T, PathBuf), SequenceError> {
+    let path = model.join(format!("{part}.bin"));
+    if path.is_file() {
+        return Ok((binary(&path)?, path));
+    }
+    let path = model.join(format!("{part}.txt"));
+    Ok((text(&path)?, path))
+}
+
+fn camera_of(camera: &ModelCamera) -> Result<Camera, String> {
+    let model = camera.model.as_str();
+    let (fx, fy, cx, cy, [k1, k2, p1, p2]) = match (model, camera.parameters.as_slice()) {
+        ("SIMPLE_PINHOLE", &[f, cx, cy]) => (f, f, cx, cy, [0.0; 4]),
+        ("PINHOLE", &[fx, fy, cx, cy]) => (fx, fy, cx, cy, [0.0; 4]),
+        ("SIMPLE_RADIAL", &[f, cx, cy, k]) => (f, f, cx, cy, [k, 0.0, 0.0, 0.0]),
+        ("RADIAL", &[f, cx, cy, k1, k2]) => (f, f, cx, cy, [k1, k2, 0.0, 0.0]),
+        ("OPENCV", &[fx, fy, cx, cy, k1, k2, p1, p2]) => (fx, fy, cx, cy, [k1, k2, p1, p2]),
+        ("SIMPLE_PINHOLE" | "PINHOLE" | "SIMPLE_RADIAL" | "RADIAL" | "OPENCV", parameters) => {
+            return Err(format!("a {model} camera does not have {} parameters", parameters.len()));
+        }
+        _ => {
+            let known = "SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL or OPENCV";
+            return Err(format!(
+                "{model} cameras are not known here; undistort the photos with COLMAP's image_undistorter, or use {known}"
+            ));
+        }
+    };
+    let side = |pixels| checks::side(pixels).ok_or_else(|| format!("{pixels} pixels are no size of an image"));
+    let pinhole = Pinhole { fx, fy, cx: cx - 0.5, cy: cy - 0.5, width: side(camera.width)?, height: side(camera.height)? };
+    checks::camera(Camera { pinhole, distortion: Distortion { k1, k2, p1, p2, k3: 0.0 }, depth_units_per_metre: 1.0 })
+}

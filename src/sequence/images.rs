@@ -1,0 +1,210 @@
+//! A plain folder of images with a `camera.toml`: for recordings that come in no dataset's layout.
+//!
+//! ```toml
+//! fps = 20.0                       # 30 if left out
+//! depth_units_per_metre = 1000.0   # with depth only
+//! [pinhole]
+//! fx = 525.0
+//! fy = 525.0
+//! cx = 319.5
+//! cy = 239.5
+//! width = 640
+//! height = 480
+//! [distortion]                     # none if left out; OpenCV's
+//! k1 = 0.1
+//! [stereo]                         # with pairs only, which must be rectified
+//! baseline_metres = 0.12
+//! ```
+//!
+//! The images are in the folder itself or in `rgb/`, perhaps with `depth/` (16-bit, registered); or in `left/` and `right/`. They go by
+//! their sorted names, so numbers in these need leading zeros; what belongs together has the same name but for the extension.
+
+use std::collections::BTreeMap;
+use std::ffi::OsString;
+use std::path::{Path, PathBuf};
+
+use serde::Deserialize;
+
+use super::{FrameEntry, Layout, Sensor, Sequence, SequenceError, checks, folder_name, images_in, read_text};
+use crate::geometry::{Camera, Distortion, Pinhole};
+
+const FILE: &str = "camera.toml";
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct CameraFile {
+    pinhole: Pinhole,
+    #[serde(default)]
+    distortion: Distortion,
+    depth_units_per_metre: Option<f64>,
+    #[serde(default = "usual_fps")]
+    fps: f64,
+    stereo: Option<StereoTable>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct StereoTable {
+    baseline_metres: f64,
+}
+
+fn usual_fps() -> f64 {
+    30.0
+}
+
+pub(super) fn recognise(folder: &Path) -> bool {
+    folder.join(FILE).is_file()
+}
+
+pub(super) fn open(folder: &Path) -> Result<Sequence, SequenceError> {
+    let path = folder.join(FILE);
+    let content = |what: &str| SequenceError::Content { path: path.clone(), what: what.into() };
+    let file = read_camera_file(&path)?;
+    let depth_units_per_metre = file.depth_units_per_metre.unwrap_or(1.0);
+    let camera = checks::camera(Camera { pinhole: file.pinhole, distortion: file.distortion, depth_units_per_metre })
+        .map_err(|what| content(&what))?;
+    if !(file.fps.is_finite() && file.fps > 0.0) {
+        return Err(content("fps must be positive"));
+    }
+    let rgb = folder.join("rgb");
+    let (color_folder, other_folder, sensor) = match file.stereo {
+        Some(StereoTable { baseline_metres }) => {
+            if !(baseline_metres.is_finite() && baseline_metres > 0.0) {
+                return Err(content("baseline_metres must be positive"));
+            }
+            if !camera.distortion.is_zero() {
+                return Err(content("stereo pairs must be rectified: remove the distortion from them, and [distortion] here"));
+            }
+            (folder.join("left"), folder.join("right"), Sensor::Stereo { baseline_metres })
+        }
+        None if folder.join("depth").is_dir() => {
+            if file.depth_units_per_metre.is_none() {
+                return Err(content("there is a folder depth, but no depth_units_per_metre"));
+            }
+            (rgb, folder.join("depth"), Sensor::Rgbd)
+        }
+        None if rgb.is_dir() => (rgb, PathBuf::new(), Sensor::Mono),
+        None => (folder.into(), PathBuf::new(), Sensor::Mono),
+    };
+    let entries = entries(&color_folder, &other_folder, sensor, file.fps)?;
+    let sequence = Sequence::new(folder_name(folder), Layout::Images, camera, sensor, entries);
+    sequence.check_first_size()?;
+    Ok(sequence)
+}
+
+fn read_camera_file(path: &Path) -> Result<CameraFile, SequenceError> {
+    let text = read_text(path)?;
+    toml::from_str(&text).map_err(|error| {
+        let before = error.span().and_then(|span| text.get(..span.start)).unwrap_or_default();
+        let line = before.matches('\n').count() + 1;
+        SequenceError::Syntax { path: path.into(), line, what: error.message().into() }
+    })
+}
+
+/// The images of a folder, each with its like-named depth or right image from the other one.
+fn entries(folder: &Path, other_folder: &Path, sensor: Sensor, fps: f64) -> Result<Vec<FrameEntry>, SequenceError> {
+    let stem = |path: &PathBuf| path.file_stem().map(OsString::from);
+    let others = if sensor == Sensor::Mono { Vec::new() } else { images_in(other_folder)? };
+    let mut others: BTreeMap<_, _> = others.into_iter().map(|path| (stem(&path), path)).collect();
+    let mut entries = Vec::new();
+    for (index, color) in images_in(folder)?.into_iter().enumerate() {
+        let other = others.remove(&stem(&color));
+        let (depth, right) = if sensor == Sensor::Rgbd { (other, None) } else { (None, other) };
+        entries.push(FrameEntry { timestamp_s: index as f64 / fps, color, depth, right });
+    }
+    if entries.is_empty() {
+        return Err(SequenceError::Empty { path: folder.into() });
+    }
+    if sensor != Sensor::Mono && entries.iter().all(|entry| entry.depth.is_none() && entry.right.is_none()) {
+        let what = format!("no image here has the name of one in {}", folder.display());
+        return Err(SequenceError::Content { path: other_folder.into(), what });
+    }
+    Ok(entries)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::sequence::SensorKind;
+
+    const PINHOLE: &str = "[pinhole]\nfx = 5.0\nfy = 5\ncx = 3.5\ncy = 2.5\nwidth = 8\nheight = 6\n";
+
+    /// Two images in each of the folders, and the camera's file.
+    fn recording(camera: &str, folders: &[&str]) -> tempfile::TempDir {
+        let folder = tempfile::tempdir().unwrap();
+        for name in folders {
+            std::fs::create_dir_all(folder.path().join(name)).unwrap();
+            for i in [2, 10] {
+                let path = folder.path().join(name).join(format!("{i:03}.png"));
+                if *name == "depth" {
+                    image::ImageBuffer::<image::Luma<u16>, _>::from_pixel(8, 6, image::Luma([500])).save(path).unwrap();
+                } else {
+                    image::RgbImage::new(8, 6).save(path).unwrap();
+                }
+            }
+        }
+        std::fs::write(folder.path().join(FILE), camera).unwrap();
+        folder
+    }
+
+    fn open(folder: &tempfile::TempDir) -> Result<Sequence, String> {
+        Sequence::open(folder.path(), None, None).map_err(|error| error.to_string())
+    }
+
+    #[test]
+    fn the_folders_say_what_the_sensor_is() {
+        for place in [".", "rgb"] {
+            let sequence = open(&recording(&format!("fps = 4\n{PINHOLE}[distortion]\nk1 = 0.1\n"), &[place])).unwrap();
+            assert_eq!((sequence.layout, sequence.sensor, sequence.entries.len()), (Layout::Images, Sensor::Mono, 2));
+            assert_eq!((sequence.camera.distortion.k1, sequence.entries[1].timestamp_s), (0.1, 0.25));
+            assert!(sequence.groundtruth.is_none());
+        }
+        let folder = recording(&format!("depth_units_per_metre = 1000.0\n{PINHOLE}"), &["rgb", "depth"]);
+        let mut sequence = open(&folder).unwrap();
+        assert_eq!((sequence.sensor, sequence.entries[1].timestamp_s), (Sensor::Rgbd, 1.0 / 30.0));
+        assert_eq!(sequence.load(1).unwrap().depth.unwrap().at(0, 0), Some(0.5));
+        sequence.restrict_to(SensorKind::Mono).unwrap();
+        assert!(sequence.load(1).unwrap().depth.is_none());
+        let folder = recording(&format!("{PINHOLE}[stereo]\nbaseline_metres = 0.12\n"), &["left", "right"]);
+        std::fs::remove_file(folder.path().join("right/002.png")).unwrap();
+        let sequence = open(&folder).unwrap();
+        assert_eq!(sequence.sensor, Sensor::Stereo { baseline_metres: 0.12 });
+        assert!(sequence.load(0).unwrap().right.is_none() && sequence.load(1).unwrap().right.is_some());
+    }
+
+    /// The README shows a file that is read as it stands.
+    #[test]
+    fn the_example_in_the_readme_is_valid() {
+        let readme = include_str!("../../README.md");
+        let example = readme.split("```toml\n").nth(1).unwrap().split("```").next().unwrap();
+        let folder = recording(example, &[]);
+        assert!(open(&folder).unwrap_err().contains("lists no frames"));
+        std::fs::write(folder.path().join(FILE), example.replace("# stereo", "stereo")).unwrap();
+        assert!(read_camera_file(&folder.path().join(FILE)).unwrap().stereo.is_some());
+    }
+
+    #[test]
+    fn faults_name_the_file_and_what_is_wrong_in_it() {
+        let refused = |camera: &str, folders: &[&str], part: &str| {
+            let message = open(&recording(camera, folders)).map(|_| ()).unwrap_err();
+            assert!(message.contains(part), "{message}");
+        };
+        let stereo = format!("{PINHOLE}[stereo]\nbaseline_metres = 0.12\n");
+        refused(&PINHOLE.replace("2.5", "x"), &["."], "camera.toml:5: ");
+        refused(&PINHOLE.replace("cx", "centre"), &["."], "camera.toml:4: unknown field `centre`");
+        refused(&PINHOLE.replace("5.0", "0.0"), &["."], "camera.toml: a camera needs");
+        refused(&PINHOLE.replace("height = 6", "height = 7"), &["."], "is 8x6, but the camera is 8x7");
+        refused(&format!("fps = 0\n{PINHOLE}"), &["."], "fps must be positive");
+        refused(PINHOLE, &[], "lists no frames");
+        refused(PINHOLE, &["rgb", "depth"], "no depth_units_per_metre");
+        refused(&stereo.replace("0.12", "-0.12"), &["left", "right"], "baseline_metres must be positive");
+        refused(&format!("{stereo}[distortion]\nk1 = 0.1\n"), &["left", "right"], "must be rectified");
+        refused(&stereo, &["left"], "right");
+        let strangers = recording(&stereo, &["left", "right"]);
+        for name in ["002", "010"] {
+            let right = strangers.path().join("right");
+            std::fs::rename(right.join(format!("{name}.png")), right.join(format!("r{name}.png"))).unwrap();
+        }
+        assert!(open(&strangers).unwrap_err().contains("no image here has the name of one in"));
+    }
+}

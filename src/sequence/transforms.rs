@@ -1,0 +1,210 @@
+//! Photos with known poses in a `transforms.json`, as NeRF's data, instant-ngp and nerfstudio have it.
+//!
+//! `frames` lists photos (`file_path`, with or without its extension) and their `transform_matrix`, camera to world, of OpenGL's camera: x
+//! right, y up, z backward; ours has y down, z forward. The lens is `fl_x fl_y cx cy w h k1 k2 k3 p1 p2`, for all frames or the same in
+//! each, or `camera_angle_x` alone. Principal points count from the image's corner, ours from the first pixel's centre. Frames stay in the
+//! order of the file, the n-th has the timestamp of n seconds.
+//!
+//! Left out: several cameras and fisheye lenses, which are refused; depth images, masks and point clouds, which are not read.
+
+use std::path::{Path, PathBuf};
+
+use nalgebra::{UnitQuaternion, Vector3};
+use serde::Deserialize;
+
+use super::{FrameEntry, Layout, Sensor, Sequence, SequenceError, checks, folder_name, read_json};
+use crate::geometry::{Camera, Distortion, Pinhole, StampedPose, Trajectory};
+
+const FILE: &str = "transforms.json";
+/// Endings of photos whose path leaves it out.
+const ENDINGS: [&str; 4] = ["", ".png", ".jpg", ".jpeg"];
+
+pub(super) fn recognise(folder: &Path) -> bool {
+    folder.join(FILE).is_file()
+}
+
+pub(super) fn open(folder: &Path) -> Result<Sequence, SequenceError> {
+    let path = folder.join(FILE);
+    let content = |what: String| SequenceError::Content { path: path.clone(), what };
+    let file: TransformsFile = read_json(&path)?;
+    let lens = file.lens().map_err(content)?;
+    let opengl_from_camera = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI);
+    let (mut entries, mut poses) = (Vec::new(), Vec::new());
+    for (index, frame) in file.frames.iter().enumerate() {
+        let in_frame = |what: String| content(format!("frame {index}, {}: {what}", frame.file_path));
+        let color = photo(folder, &frame.file_path)
+            .ok_or_else(|| in_frame("there is no such file; check that the recording was copied whole".into()))?;
+        let world_from_opengl = checks::rigid(frame.transform_matrix.as_flattened()).map_err(in_frame)?;
+        let timestamp_s = index as f64;
+        entries.push(FrameEntry { timestamp_s, color, depth: None, right: None });
+        poses.push(StampedPose { timestamp_s, world_from_camera: world_from_opengl * opengl_from_camera });
+    }
+    let first = &entries.first().ok_or_else(|| SequenceError::Empty { path: path.clone() })?.color;
+    let size = image::image_dimensions(first).map_err(|source| SequenceError::Image { path: first.clone(), source })?;
+    let camera = lens.camera(size).map_err(content)?;
+    let groundtruth = Some(Trajectory { poses });
+    let name = folder_name(folder);
+    let sequence = Sequence { groundtruth, ..Sequence::new(name, Layout::Transforms, camera, Sensor::Mono, entries) };
+    sequence.check_first_size()?;
+    Ok(sequence)
+}
+
+/// The photo that a path means.
+fn photo(folder: &Path, file_path: &str) -> Option<PathBuf> {
+    ENDINGS.iter().map(|ending| folder.join(format!("{file_path}{ending}"))).find(|path| path.is_file())
+}
+
+#[derive(Deserialize)]
+struct TransformsFile {
+    camera_model: Option<String>,
+    #[serde(default)]
+    is_fisheye: bool,
+    #[serde(flatten)]
+    lens: Lens,
+    frames: Vec<ListedFrame>,
+}
+
+#[derive(Deserialize)]
+struct ListedFrame {
+    file_path: String,
+    transform_matrix: [[f64; 4]; 4],
+    #[serde(flatten)]
+    lens: Lens,
+}
+
+/// Pixels, and radians across the whole image.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Deserialize)]
+#[serde(default)]
+struct Lens {
+    camera_angle_x: Option<f64>,
+    camera_angle_y: Option<f64>,
+    fl_x: Option<f64>,
+    fl_y: Option<f64>,
+    cx: Option<f64>,
+    cy: Option<f64>,
+    w: Option<f64>,
+    h: Option<f64>,
+    k1: f64,
+    k2: f64,
+    k3: f64,
+    k4: f64,
+    p1: f64,
+    p2: f64,
+}
+
+impl TransformsFile {
+    /// The one lens of all frames.
+    fn lens(&self) -> Result<Lens, String> {
+        let model = self.camera_model.as_deref().unwrap_or("OPENCV");
+        if self.is_fisheye || !["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"].contains(&model)
+        {
+            let fisheye = if self.is_fisheye { " fisheye" } else { "" };
+            return Err(format!("{model}{fisheye} cameras are not known here; undistort the photos first"));
+        }
+        let of_frame = |frame: &ListedFrame| if frame.lens.is_given() { frame.lens } else { self.lens };
+        let lens = self.frames.first().map_or(self.lens, of_frame);
+        match self.frames.iter().position(|frame| of_frame(frame) != lens) {
+            Some(other) => Err(format!("frame {other} has another camera than frame 0; a recording needs one")),
+            None => Ok(lens),
+        }
+    }
+}
+
+impl Lens {
+    fn is_given(&self) -> bool {
+        self.fl_x.is_some() || self.camera_angle_x.is_some()
+    }
+
+    /// The camera of photos of that size, if it does not say its own.
+    fn camera(&self, (width, height): (u32, u32)) -> Result<Camera, String> {
+        let (w, h) = (self.w.unwrap_or(f64::from(width)), self.h.unwrap_or(f64::from(height)));
+        let side = |pixels: f64| {
+            let whole = (pixels.fract() == 0.0 && pixels > 0.0).then_some(pixels as u64);
+            whole.and_then(checks::side).ok_or_else(|| format!("{pixels} pixels are no size of an image"))
+        };
+        let focal_of_angle = |angle_rad: f64, pixels: f64| pixels / 2.0 / (angle_rad / 2.0).tan();
+        let fx = self.fl_x.or_else(|| self.camera_angle_x.map(|angle_rad| focal_of_angle(angle_rad, w)));
+        let fx = fx.ok_or("there is neither fl_x nor camera_angle_x")?;
+        let fy = self.fl_y.or_else(|| self.camera_angle_y.map(|angle_rad| focal_of_angle(angle_rad, h))).unwrap_or(fx);
+        if self.k4 != 0.0 {
+            return Err("lenses with k4 are not known here; undistort the photos first".into());
+        }
+        let (cx, cy) = (self.cx.unwrap_or(w / 2.0) - 0.5, self.cy.unwrap_or(h / 2.0) - 0.5);
+        let pinhole = Pinhole { fx, fy, cx, cy, width: side(w)?, height: side(h)? };
+        let distortion = Distortion { k1: self.k1, k2: self.k2, p1: self.p1, p2: self.p2, k3: self.k3 };
+        checks::camera(Camera { pinhole, distortion, depth_units_per_metre: 1.0 })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Point3;
+
+    use super::*;
+
+    const LENS: &str = r#""fl_x": 10.0, "fl_y": 11.0, "cx": 4.0, "cy": 3.0, "w": 8, "h": 6.0, "k1": 0.1, "p2": 0.02"#;
+    /// Straight down from two metres up, with the image's top towards the world's y; then a step to the right.
+    const FRAMES: &str = r#"[
+        { "file_path": "./images/b.png", "sharpness": 3, "transform_matrix": [[1,0,0,0],[0,1,0,0],[0,0,1,2],[0,0,0,1]] },
+        { "file_path": "images/a",
+          "transform_matrix": [[1,0,0,1],[0,1,0,0],[0,0,1,2],[0,0,0,1]] }]"#;
+
+    fn recording(lens: &str, frames: &str) -> tempfile::TempDir {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::create_dir(folder.path().join("images")).unwrap();
+        image::RgbImage::new(8, 6).save(folder.path().join("images/b.png")).unwrap();
+        image::RgbImage::new(8, 6).save(folder.path().join("images/a.jpg")).unwrap();
+        let comma = if lens.is_empty() { "" } else { "," };
+        std::fs::write(folder.path().join(FILE), format!("{{ {lens}{comma} \"aabb_scale\": 16,\n\"frames\": {frames} }}"))
+            .unwrap();
+        folder
+    }
+
+    fn open(lens: &str, frames: &str) -> Result<Sequence, String> {
+        Sequence::open(recording(lens, frames).path(), None, None).map_err(|error| error.to_string())
+    }
+
+    #[test]
+    fn photos_lens_and_poses_are_read() {
+        let folder = recording(LENS, FRAMES);
+        let sequence = Sequence::open(folder.path(), None, None).unwrap();
+        assert_eq!((sequence.layout, sequence.sensor), (Layout::Transforms, Sensor::Mono));
+        let pinhole = Pinhole { fx: 10.0, fy: 11.0, cx: 3.5, cy: 2.5, width: 8, height: 6 };
+        assert_eq!(sequence.camera.pinhole, pinhole);
+        assert_eq!(sequence.camera.distortion, Distortion { k1: 0.1, p2: 0.02, ..Distortion::default() });
+        assert_eq!(sequence.load(1).unwrap().timestamp_s, 1.0);
+        let poses = sequence.groundtruth.unwrap().poses;
+        let on_floor = |i: usize, x: f64, y: f64| poses[i].world_from_camera * Point3::new(x, y, 2.0);
+        // A point below the image's centre is towards -y of the world, as its top is towards +y.
+        assert!((on_floor(0, 0.5, 1.0) - Point3::new(0.5, -1.0, 0.0)).norm() < 1e-12);
+        assert!((on_floor(1, 0.0, 0.0) - Point3::new(1.0, 0.0, 0.0)).norm() < 1e-12);
+    }
+
+    #[test]
+    fn an_angle_is_a_lens_and_frames_may_carry_it() {
+        let pinhole = open(r#""camera_angle_x": 1.5707963267948966"#, FRAMES).unwrap().camera.pinhole;
+        assert!((pinhole.fx - 4.0).abs() < 1e-9 && pinhole.fy == pinhole.fx);
+        assert_eq!((pinhole.cx, pinhole.cy, pinhole.width, pinhole.height), (3.5, 2.5, 8, 6));
+        let each = FRAMES.replace("\"file_path\"", &format!("{LENS}, \"file_path\""));
+        assert_eq!(open("", &each).unwrap().camera.pinhole.fy, 11.0);
+        assert!(open("", &each.replacen("11.0", "12.0", 1)).unwrap_err().contains("frame 1 has another camera"));
+    }
+
+    #[test]
+    fn faults_name_the_file_and_the_frame() {
+        let refused = |lens: &str, frames: &str, part: &str| {
+            let message = open(lens, frames).map(|_| ()).unwrap_err();
+            assert!(message.contains("transforms.json") && message.contains(part), "{message}");
+        };
+        refused(LENS, &FRAMES.replace("images/a", "images/c"), "frame 1, images/c: there is no such file");
+        refused(LENS, &FRAMES.replacen("[0,0,1,2]", "[0,0,3,2]", 1), "frame 0, ./images/b.png: the first three");
+        refused(LENS, &FRAMES.replacen("[0,0,1,2]", "[0,0,1]", 1), "transforms.json:3: ");
+        refused(LENS, "[]", "lists no frames");
+        refused("", FRAMES, "neither fl_x nor camera_angle_x");
+        refused(&LENS.replace("10.0", "-10.0"), FRAMES, "a camera needs");
+        refused(&LENS.replace("6.0", "6.5"), FRAMES, "6.5 pixels are no size");
+        refused(&format!("{LENS}, \"camera_model\": \"OPENCV_FISHEYE\""), FRAMES, "OPENCV_FISHEYE cameras");
+        refused(&format!("{LENS}, \"is_fisheye\": true"), FRAMES, "fisheye cameras");
+        assert!(open(&LENS.replace("\"w\": 8", "\"w\": 16"), FRAMES).unwrap_err().contains("is 8x6, but the camera is 16x6"));
+    }
+}
