@@ -2,12 +2,14 @@
 //!
 //! Knows nothing of how poses and pictures were made; rendering them is the caller's business.
 
+mod drawing;
 pub mod image;
 pub mod machine;
 pub mod metrics;
 pub mod trajectory;
 pub mod views;
 
+pub use drawing::draw_trajectory;
 pub use image::{ImageError, ImageF32, depth_l1, psnr, psnr_where_lit, ssim};
 pub use metrics::{Metrics, Times, sha256_hex, write_json};
 pub use trajectory::{Alignment, AlignmentError, Similarity, TrajectoryErrors, evaluate_trajectory};

@@ -10,7 +10,7 @@ use super::Outcome;
 use crate::config::Config;
 use crate::evaluation::metrics::{Adapter, AteFigures, MappingFigures, Metrics, RpeFigures, Times, UsualTimes};
 use crate::evaluation::views::{ComparedView, ViewSelection, evaluate_views};
-use crate::evaluation::{Alignment, evaluate_trajectory, machine, sha256_hex, write_json};
+use crate::evaluation::{Alignment, draw_trajectory, evaluate_trajectory, machine, sha256_hex, write_json};
 use crate::export::{ExportError, MapFormat, write_atomically};
 use crate::geometry::{Se3, Trajectory};
 use crate::gpu::{Gpu, GpuError};
@@ -24,6 +24,7 @@ pub const MAP: &str = "map.ply";
 pub const METRICS: &str = "metrics.json";
 pub const CONFIG: &str = "config.toml";
 pub const VIEWS: &str = "views";
+pub const DRAWING: &str = "trajectory.svg";
 
 /// At most this many held-out views are kept as pictures, spread evenly.
 const MAX_PICTURES: usize = 100;
@@ -34,6 +35,8 @@ pub enum OutputError {
     Folder { path: PathBuf, source: std::io::Error },
     #[error("cannot remove {path}, which is of an earlier run: {source}; choose another folder with --out")]
     Remove { path: PathBuf, source: std::io::Error },
+    #[error("cannot draw the trajectory: {0}; please report this")]
+    Drawing(String),
     #[error("cannot encode {path}: {source}")]
     Picture { path: PathBuf, source: image::ImageError },
     #[error(transparent)]
@@ -117,6 +120,11 @@ pub fn measure(
     let alignment = if sequence.sensor.kind() == SensorKind::Mono { Alignment::Similarity } else { Alignment::Rigid };
     let errors = |estimate: &Trajectory| truth.and_then(|truth| evaluate_trajectory(truth, estimate, alignment).ok());
     let (all, keyframes) = (errors(subject.trajectory), errors(&subject.keyframes));
+    remove_file(&out.join(DRAWING))?;
+    if let (Some(truth), Some(errors)) = (truth, &all) {
+        let svg = draw_trajectory(truth, subject.trajectory, errors).map_err(OutputError::Drawing)?;
+        write_atomically(&out.join(DRAWING), svg.as_bytes())?;
+    }
     let is_held_out = |index: usize| config.replay.is_held_out(index);
     let held_out = subject.poses.iter().filter(|(index, _)| is_held_out(*index)).count();
     let picture_every = held_out.div_ceil(MAX_PICTURES).max(1);
