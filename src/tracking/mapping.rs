@@ -32,6 +32,7 @@ pub fn insert_keyframe(map: &mut Map, mut keyframe: Keyframe, pinhole: &Pinhole,
     let world_from_camera = keyframe.camera_from_world.inverse();
     keyframe.landmarks = vec![None; features.len()];
     map.keyframes.push(keyframe);
+    map.places.insert(id, &features.features);
     for (feature, landmark) in tracked.into_iter().enumerate() {
         if let Some(landmark) = landmark.and_then(|l| map.resolve(l)) {
             map.add_sighting(landmark, Sighting { keyframe: id, feature });
@@ -78,7 +79,7 @@ fn neighbours(map: &Map, keyframe: usize) -> Vec<usize> {
 }
 
 /// Looks for `landmarks` in a keyframe: adds sightings, and merges where the feature found shows another landmark.
-fn join(map: &mut Map, keyframe: usize, landmarks: &[usize], pinhole: &Pinhole, config: &TrackingConfig) {
+pub fn join(map: &mut Map, keyframe: usize, landmarks: &[usize], pinhole: &Pinhole, config: &TrackingConfig) {
     let target = &map.keyframes[keyframe];
     let (mut asked, mut queries) = (Vec::new(), Vec::new());
     for l in landmarks {

@@ -1,6 +1,6 @@
 //! The tracker: one frame at a time to a pose, and now and then a keyframe. Owns the map; runs in the caller's thread.
 //!
-//! It leaves out what the rest of the project does elsewhere or not at all: loop closing over large drift, and rendering.
+//! It leaves out what the rest of the project does elsewhere: rendering.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -9,6 +9,7 @@ use super::features::Extractor;
 use super::frame_features::FrameFeatures;
 use super::keyframe;
 use super::localise::{Context, Localised};
+use super::loop_closing::LoopCloser;
 use super::map::{Keyframe, Map};
 use super::{KeyframePose, NewKeyframe, StageTimes, TrackedFrame, TrackingConfig, TrackingError, TrackingState, mapping, window};
 use crate::geometry::{Camera, Se3, StampedPose};
@@ -27,6 +28,7 @@ pub struct Tracker {
     config: TrackingConfig,
     extractor: Extractor,
     map: Map,
+    loops: LoopCloser,
     /// The last frame with a pose; `None` before the map is started.
     last: Option<LastFrame>,
     /// camera_from_last_camera, as of the last two frames in a row.
@@ -69,6 +71,7 @@ impl Tracker {
             config: config.clone(),
             extractor: Extractor::new(camera.pinhole.width, camera.pinhole.height, config),
             map: Map::default(),
+            loops: LoopCloser::default(),
             last: None,
             velocity: None,
             reference: 0,
@@ -262,14 +265,30 @@ impl Tracker {
         mapping::remove_unproven(&mut self.map, id);
         times.mapping_ms = milliseconds(clock);
         let clock = Instant::now();
-        let moved = window::adjust_window(&mut self.map, id, pinhole, config);
+        let mut moved = window::adjust_window(&mut self.map, id, pinhole, config);
         times.bundle_ms = milliseconds(clock);
+        let clock = Instant::now();
+        if let Some(bent) = self.close_loop(id) {
+            moved = bent;
+        }
+        times.loops_ms = milliseconds(clock);
         let pose = |k: usize| self.map.keyframes[k].camera_from_world;
         let updates = moved.into_iter().filter(|k| *k != id).map(|k| (k, pose(k).inverse())).collect();
         let camera_from_world = pose(id);
         self.reference = id;
         self.last = Some(LastFrame { features, camera_from_world, landmarks: self.map.keyframes[id].landmarks.clone() });
         (NewKeyframe { id, world_from_camera: camera_from_world.inverse(), covisible: self.map.covisible(id) }, updates)
+    }
+
+    /// Closes a loop if the newest keyframe shows one: returns the keyframes that may have moved. Frames follow their keyframes.
+    fn close_loop(&mut self, keyframe: usize) -> Option<Vec<usize>> {
+        let moved =
+            self.config.loop_closing.then(|| self.loops.close(&mut self.map, keyframe, &self.camera.pinhole, &self.config))?;
+        for (keyframe, growth) in &moved {
+            let theirs = self.records.iter_mut().filter(|r| r.reference == *keyframe);
+            theirs.for_each(|r| r.camera_from_reference.translation.vector *= *growth);
+        }
+        (!moved.is_empty()).then(|| moved.into_iter().map(|(k, _)| k).collect())
     }
 
     fn record(&mut self, frame: &Frame, reference: usize, camera_from_reference: Se3) {
