@@ -32,7 +32,7 @@ const PROJECTION_RADIUS: f64 = 6.0;
 const PROJECTION_RULES: Rules = Rules { max_distance: 60, ratio: 0.9, check_rotation: false };
 /// Landmarks of the place that the keyframe must show, in number and as a share of what it should show.
 const MIN_INLIERS: usize = 40;
-const MIN_FOUND_SHARE: f64 = 0.2;
+const MIN_FOUND_SHARE: f64 = 0.15;
 /// The same of the keyframe's neighbours, and how many of how many must agree.
 const MIN_NEIGHBOUR_INLIERS: usize = 25;
 const NEIGHBOURS_ASKED: usize = 4;

@@ -246,11 +246,6 @@ impl Keyframe {
         self.camera_from_world.inverse_transform_point(&Point3::origin())
     }
 
-    /// The camera's viewing direction in the world.
-    pub fn forward(&self) -> Vector3<f64> {
-        self.camera_from_world.rotation.inverse() * Vector3::z()
-    }
-
     /// How many landmarks it sees that at least `sightings` keyframes see.
     pub fn landmark_count(&self, map: &Map, sightings: usize) -> usize {
         self.landmarks.iter().flatten().filter(|l| map.landmarks[**l].sightings.len() >= sightings).count()

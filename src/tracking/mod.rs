@@ -15,6 +15,8 @@ mod keyframe;
 mod localise;
 mod loop_alignment;
 mod loop_closing;
+#[cfg(test)]
+mod loop_closing_tests;
 mod loop_correction;
 mod map;
 mod mapping;
