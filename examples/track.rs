@@ -87,4 +87,5 @@ fn print_times(times: &[StageTimes]) {
     row("localise", |t| t.localise_ms);
     row("mapping", |t| t.mapping_ms);
     row("bundle", |t| t.bundle_ms);
+    row("loops", |t| t.loops_ms);
 }

@@ -3,8 +3,7 @@
 use std::path::Path;
 
 use image::{Rgb, RgbImage};
-use keysplat::geometry::{Camera, Distortion, Pinhole, Se3, se3};
-
+use keysplat::geometry::{Camera, Distortion, Pinhole, Se3, StampedPose, se3};
 use keysplat::sequence::{DepthImage, Frame, Sensor, Sequence};
 use keysplat::tracking::{TrackedFrame, Tracker, TrackingConfig, TrackingState};
 use nalgebra::{Point3, Vector2, Vector3, Vector6};
@@ -153,6 +152,39 @@ fn blind_frames_are_lost_and_the_camera_is_found_again() {
     assert_close(&tracked.world_from_camera.unwrap(), 2);
     let frames: Vec<usize> = tracker.trajectory().iter().map(|(index, _)| *index).collect();
     assert_eq!(frames, [0, 1, 2, 3, 4, 5, 9]);
+}
+
+/// A full turn on a small circle, looking outwards, and a little further.
+fn turn(index: usize) -> Se3 {
+    let angle = index as f64 * 0.1;
+    Se3::new(Vector3::zeros(), Vector3::y() * angle) * Se3::translation(0.05 * (0.2 * index as f64).sin(), 0.0, 0.5)
+}
+
+#[test]
+fn a_closed_loop_takes_the_drift_out() {
+    // A focal length that is off by 2% turns a full circle into less than one: drift.
+    let mut camera = CAMERA;
+    (camera.pinhole.fx, camera.pinhole.fy) = (1.02 * camera.pinhole.fx, 1.02 * camera.pinhole.fy);
+    let frames: Vec<Frame> = (0..72).map(|i| render(i, &turn(i))).collect();
+    let run = |loop_closing: bool| {
+        let config = TrackingConfig { loop_closing, bundle_iterations: 0, ..config() };
+        let mut tracker = Tracker::new(camera, Sensor::Rgbd, &config).unwrap();
+        let mut moved = 0;
+        for (i, frame) in frames.iter().enumerate() {
+            let tracked = tracker.track(frame, true).unwrap();
+            assert_eq!(tracked.state, TrackingState::Tracking, "frame {i}");
+            moved += tracked.updates.len();
+        }
+        // The circle is also too wide; that is no drift, and stays.
+        let off =
+            |(i, pose): &(usize, StampedPose)| (turn(0).inverse() * turn(*i)).rotation.angle_to(&pose.world_from_camera.rotation);
+        let trajectory = tracker.trajectory();
+        (trajectory.iter().map(off).sum::<f64>() / trajectory.len() as f64, moved, trajectory)
+    };
+    let (open, closed) = (run(false), run(true));
+    assert!(open.0 > 0.02 && closed.0 < 0.3 * open.0, "{} rad against {} rad", closed.0, open.0);
+    assert!(open.1 == 0 && closed.1 > 20, "keyframes move only where a loop is closed: {}, {}", open.1, closed.1);
+    assert_eq!(run(true).2, closed.2);
 }
 
 #[test]

@@ -14,8 +14,11 @@ const ERROR: RGBColor = RGBColor(200, 60, 40);
 
 /// The path as seen along the axis in which it extends least, truth in grey, and below it the error in centimetres over time.
 pub fn draw_trajectory(truth: &Trajectory, estimate: &Trajectory, errors: &TrajectoryErrors) -> Result<String, String> {
-    let aligned: Vec<[f64; 3]> =
-        estimate.poses.iter().map(|p| errors.alignment.transform(&p.world_from_camera.translation.vector).into()).collect();
+    let aligned: Vec<[f64; 3]> = estimate
+        .poses
+        .iter()
+        .map(|p| errors.alignment.act(&p.world_from_camera.translation.vector.into()).coords.into())
+        .collect();
     let real: Vec<[f64; 3]> = truth.poses.iter().map(|p| p.world_from_camera.translation.vector.into()).collect();
     let pairs = associate(truth, estimate, MAX_TIME_DIFFERENCE_S);
     let error = |a: &[f64; 3], b: &[f64; 3]| a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt();

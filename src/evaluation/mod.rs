@@ -12,4 +12,4 @@ pub mod views;
 pub use drawing::draw_trajectory;
 pub use image::{ImageError, ImageF32, depth_l1, psnr, psnr_where_lit, ssim};
 pub use metrics::{Metrics, Times, sha256_hex, write_json};
-pub use trajectory::{Alignment, AlignmentError, Similarity, TrajectoryErrors, evaluate_trajectory};
+pub use trajectory::{Alignment, AlignmentError, TrajectoryErrors, evaluate_trajectory};

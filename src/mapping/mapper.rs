@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 
 use fastrand::Rng;
 
+use super::anchors::{self, Anchors};
 use super::keyframe::MappedKeyframe;
 use super::{Keyframe, KeyframeId, MappingConfig, prune, seeding};
 use crate::geometry::Se3;
@@ -49,6 +50,7 @@ pub struct Mapper {
     rasterizer: Rasterizer,
     optimiser: Optimiser,
     cloud: GpuCloud,
+    anchors: Anchors,
     keyframes: Vec<MappedKeyframe>,
     rng: Rng,
     step_times: Vec<Duration>,
@@ -62,6 +64,7 @@ impl Mapper {
             optimiser: Optimiser::new(&rasterizer)?,
             rasterizer,
             cloud: GpuCloud::new(&gpu, config.sh_degree, FIRST_CAPACITY)?,
+            anchors: Anchors::default(),
             keyframes: Vec::new(),
             rng: Rng::with_seed(config.seed),
             step_times: Vec::new(),
@@ -83,18 +86,26 @@ impl Mapper {
         let before = self.cloud.len();
         let keep = prune::plan(&self.gpu, &self.cloud, &self.config.prune)?;
         self.cloud.keep(&self.gpu, &keep)?;
+        self.anchors.keep(&keep);
         let gaussians = self.cloud.len();
         Ok(KeyframeReport { id: keyframe.id, seeded, pruned: before - gaussians, gaussians, iterations: done, psnr_db })
     }
 
-    /// Moves earlier keyframes to better poses. Unknown ids are those that were never sent to the mapper.
-    pub fn update_poses(&mut self, updates: &[(KeyframeId, Se3)]) {
+    /// Moves earlier keyframes to better poses, and with those that move far the Gaussians seeded from them; returns how many. Unknown
+    /// ids are those that were never sent to the mapper.
+    pub fn update_poses(&mut self, updates: &[(KeyframeId, Se3)]) -> Result<usize, MappingError> {
+        let mut motions = BTreeMap::new();
         let updates: BTreeMap<KeyframeId, &Se3> = updates.iter().map(|(id, pose)| (*id, pose)).collect();
         for keyframe in &mut self.keyframes {
             if let Some(world_from_camera) = updates.get(&keyframe.id) {
+                let old_world_from_camera = keyframe.camera.camera_from_world.inverse();
+                motions.extend(anchors::motion(&old_world_from_camera, world_from_camera).map(|motion| (keyframe.id, motion)));
                 keyframe.camera.camera_from_world = world_from_camera.inverse();
             }
         }
+        let moved = self.anchors.moved(&motions);
+        self.cloud.transform(&self.gpu, &moved)?;
+        Ok(moved.iter().map(|(run, _)| run.len()).sum())
     }
 
     /// The map as it is now.
@@ -119,7 +130,8 @@ impl Mapper {
     fn seed(&mut self, keyframe: &Keyframe, camera: &ViewCamera) -> Result<usize, MappingError> {
         let rendered = if self.cloud.is_empty() { None } else { Some(self.render(camera)?) };
         let seeds = seeding::seed(keyframe, rendered.as_ref(), &self.config.seeding, self.config.sh_degree);
-        self.cloud.append(&self.gpu, &seeds)?;
+        let left_out = self.cloud.append(&self.gpu, &seeds)?;
+        self.anchors.append(keyframe.id, seeds.len() - left_out);
         Ok(seeds.len())
     }
 

@@ -31,21 +31,22 @@ pub(super) fn map(gpu: &Arc<Gpu>, config: &MappingConfig, messages: &Receiver<Ma
     for message in messages {
         let done = guarded("mapping", || match message {
             MapperMessage::PoseUpdate(updates) => {
-                mapper.update_poses(&updates);
-                Ok(None)
+                let moved = mapper.update_poses(&updates)?;
+                Ok(if moved > 0 { Some((None, Arc::new(mapper.download()?))) } else { None })
             }
             MapperMessage::Keyframe(keyframe) => {
                 let report = mapper.insert(&keyframe, &|| progress.stopped())?;
-                Ok(Some((report, Arc::new(mapper.download()?))))
+                Ok(Some((Some(report), Arc::new(mapper.download()?))))
             }
         });
         match done {
             Ok(None) => {}
             Ok(Some((report, cloud))) => {
-                tracing::debug!(?report, "keyframe mapped");
+                tracing::debug!(?report, "map changed");
                 summary.cloud = cloud.clone();
-                summary.reports.push(report);
-                progress.mapping.force_push(MapSnapshot { cloud, keyframes: summary.reports.len(), psnr_db: report.psnr_db });
+                summary.reports.extend(report);
+                let psnr_db = summary.reports.last().map_or(0.0, |r| r.psnr_db);
+                progress.mapping.force_push(MapSnapshot { cloud, keyframes: summary.reports.len(), psnr_db });
             }
             Err(error) => {
                 summary.error = Some(error);

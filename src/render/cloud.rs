@@ -1,9 +1,13 @@
 //! The map's Gaussians on the GPU: parameters and Adam moments in planes of vec4.
 
+use std::ops::Range;
+
 use glam::{Quat, Vec3};
+use nalgebra::Point3;
 
 use super::layout::{BlendForm, GEOMETRY_PLANES, GatherSetup};
 use super::shaders;
+use crate::geometry::Se3;
 use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, workgroups};
 use crate::splat::{GaussianCloud, ShDegree};
 
@@ -89,6 +93,34 @@ impl GpuCloud {
     /// Keeps the Gaussians at `chosen` (ascending indices), parameters and moments together.
     pub fn keep(&mut self, gpu: &Gpu, chosen: &[u32]) -> Result<(), GpuError> {
         if chosen.len() == self.count { Ok(()) } else { self.rebuild(gpu, chosen, self.capacity) }
+    }
+
+    /// Moves runs of Gaussians rigidly (new_from_old, in the world) and forgets their moments, which belong to where they were. On the
+    /// host: this is rare. The harmonics above the constant stay as they are, for a closed loop turns little.
+    pub fn transform(&mut self, gpu: &Gpu, runs: &[(Range<usize>, Se3)]) -> Result<(), GpuError> {
+        if runs.is_empty() {
+            return Ok(());
+        }
+        let mut means = self.read_plane(gpu, 0)?;
+        let mut rotations = self.read_plane(gpu, 2)?;
+        for (run, motion) in runs {
+            let [x, y, z, w] = motion.rotation.coords.map(|v| v as f32).into();
+            let turn = Quat::from_xyzw(x, y, z, w);
+            for (mean, rotation) in means[run.clone()].iter_mut().zip(&mut rotations[run.clone()]) {
+                let p = motion * Point3::new(f64::from(mean[0]), f64::from(mean[1]), f64::from(mean[2]));
+                *mean = [p.x as f32, p.y as f32, p.z as f32, mean[3]];
+                let q = turn * Quat::from_xyzw(rotation[1], rotation[2], rotation[3], rotation[0]);
+                *rotation = [q.w, q.x, q.y, q.z];
+            }
+            let zeros = vec![[0.0f32; 4]; run.len()];
+            for plane in 0..self.planes() {
+                self.moments_1.write(gpu, plane * self.capacity + run.start, &zeros);
+                self.moments_2.write(gpu, plane * self.capacity + run.start, &zeros);
+            }
+        }
+        self.parameters.write(gpu, 0, &means);
+        self.parameters.write(gpu, 2 * self.capacity, &rotations);
+        Ok(())
     }
 
     fn rebuild(&mut self, gpu: &Gpu, chosen: &[u32], capacity: usize) -> Result<(), GpuError> {

@@ -18,6 +18,11 @@ impl Descriptor {
     pub fn distance(&self, other: &Self) -> u32 {
         (0..4).map(|k| (self.0[k] ^ other.0[k]).count_ones()).sum()
     }
+
+    /// Bit number `index` of 256, 0 or 1.
+    pub fn bit(&self, index: usize) -> usize {
+        (self.0[index / 64] >> (index % 64) & 1) as usize
+    }
 }
 
 /// The descriptor with the least median distance to all of them: the one that stands best for a landmark. `None` of none.

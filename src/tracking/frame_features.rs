@@ -15,8 +15,6 @@ use crate::sequence::{DepthImage, Frame, Sensor};
 const CELL_PIXELS: f64 = 16.0;
 /// Relative standard deviation of depth up to which a measurement makes a point.
 const MAX_DEPTH_ERROR: f64 = 0.08;
-/// Size of the thumbnail by which places are recognised.
-const THUMBNAIL: (usize, usize) = (40, 30);
 
 /// One feature of a frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -36,8 +34,6 @@ pub struct Feature {
 #[derive(Clone, Debug)]
 pub struct FrameFeatures {
     pub features: Vec<Feature>,
-    /// Small, blurred, of zero mean and unit norm (Klein & Murray's relocaliser, ECCV 2008). All 0 for a blank frame.
-    pub thumbnail: Vec<f32>,
     columns: usize,
     rows: usize,
     /// `cells[c]..cells[c + 1]` are the places in `order` of cell `c`'s features.
@@ -47,7 +43,7 @@ pub struct FrameFeatures {
 
 impl FrameFeatures {
     /// Features of a list, put in a grid.
-    pub fn new(features: Vec<Feature>, thumbnail: Vec<f32>, pinhole: &Pinhole) -> Self {
+    pub fn new(features: Vec<Feature>, pinhole: &Pinhole) -> Self {
         let columns = (f64::from(pinhole.width) / CELL_PIXELS).ceil().max(1.0) as usize;
         let rows = (f64::from(pinhole.height) / CELL_PIXELS).ceil().max(1.0) as usize;
         let cell_of = |f: &Feature| cell(f.pixel.y, rows) * columns + cell(f.pixel.x, columns);
@@ -61,7 +57,7 @@ impl FrameFeatures {
         for c in 1..cells.len() {
             cells[c] += cells[c - 1];
         }
-        Self { features, thumbnail, columns, rows, cells, order }
+        Self { features, columns, rows, cells, order }
     }
 
     /// Extracts the features of a frame and finds their depths, from the depth image or from the right eye.
@@ -95,7 +91,7 @@ impl FrameFeatures {
             })
             .filter(|f| f.pixel.iter().all(|v| v.is_finite()))
             .collect();
-        Ok(Self::new(features, thumbnail(grey, frame.color.width() as usize, frame.color.height() as usize), &camera.pinhole))
+        Ok(Self::new(features, &camera.pinhole))
     }
 
     pub fn len(&self) -> usize {
@@ -200,27 +196,6 @@ fn believed_depth(depth: &DepthImage, pixel: &Vector2<f64>, config: &TrackingCon
     Some(centre)
 }
 
-fn thumbnail(grey: &[u8], width: usize, height: usize) -> Vec<f32> {
-    let (columns, rows) = THUMBNAIL;
-    let mut small = vec![0.0f32; columns * rows];
-    for row in 0..rows {
-        let ys = row * height / rows..((row + 1) * height / rows).max(row * height / rows + 1).min(height);
-        for column in 0..columns {
-            let xs = column * width / columns..((column + 1) * width / columns).max(column * width / columns + 1).min(width);
-            let count = (xs.len() * ys.len()).max(1) as f32;
-            let sum: u32 = ys.clone().flat_map(|y| &grey[y * width + xs.start..y * width + xs.end]).map(|v| u32::from(*v)).sum();
-            small[row * columns + column] = sum as f32 / count;
-        }
-    }
-    let mean = small.iter().sum::<f32>() / small.len() as f32;
-    small.iter_mut().for_each(|v| *v -= mean);
-    let norm = small.iter().map(|v| v * v).sum::<f32>().sqrt();
-    // A blank picture resembles nothing.
-    let scale = if norm > 1e-3 { 1.0 / norm } else { 0.0 };
-    small.iter_mut().for_each(|v| *v *= scale);
-    small
-}
-
 #[cfg(test)]
 pub(super) mod tests {
     use super::super::measurement::tests::PINHOLE;
@@ -236,7 +211,7 @@ pub(super) mod tests {
         // Some lie outside of the image, as undistorted pixels may.
         let mut coordinate = |size: f64| random.f64() * (size + 40.0) - 20.0;
         let list: Vec<Feature> = (0..800).map(|_| feature(coordinate(640.0), coordinate(480.0), Descriptor::default())).collect();
-        let grid = FrameFeatures::new(list.clone(), Vec::new(), &PINHOLE);
+        let grid = FrameFeatures::new(list.clone(), &PINHOLE);
         for _ in 0..200 {
             let (centre, radius) = (Vector2::new(coordinate(640.0), coordinate(480.0)), coordinate(60.0).abs());
             let mut found = Vec::new();

@@ -9,6 +9,7 @@ use nalgebra::{Point3, Vector2, Vector3};
 use super::TrackingConfig;
 use super::descriptor::{Descriptor, representative};
 use super::frame_features::FrameFeatures;
+use super::places::Places;
 use crate::geometry::{Pinhole, Se3};
 
 /// A landmark is looked for only within 60° of the mean direction from which it was seen.
@@ -76,6 +77,8 @@ pub struct Prediction {
 pub struct Map {
     pub keyframes: Vec<Keyframe>,
     pub landmarks: Vec<Landmark>,
+    /// By which keyframes are recognised.
+    pub places: Places,
 }
 
 impl Map {
@@ -252,11 +255,6 @@ impl Keyframe {
         self.camera_from_world.inverse_transform_point(&Point3::origin())
     }
 
-    /// The camera's viewing direction in the world.
-    pub fn forward(&self) -> Vector3<f64> {
-        self.camera_from_world.rotation.inverse() * Vector3::z()
-    }
-
     /// How many landmarks it sees that at least `sightings` keyframes see.
     pub fn landmark_count(&self, map: &Map, sightings: usize) -> usize {
         self.landmarks.iter().flatten().filter(|l| map.landmarks[**l].sightings.len() >= sightings).count()
@@ -276,7 +274,7 @@ mod tests {
     /// Three keyframes of ten features each, at one place.
     fn map() -> Map {
         let list = (0..10).map(|i| feature(50.0 * f64::from(i), 100.0, Descriptor([1 << i, 0, 0, 0]))).collect();
-        let features = Arc::new(FrameFeatures::new(list, Vec::new(), &PINHOLE));
+        let features = Arc::new(FrameFeatures::new(list, &PINHOLE));
         let keyframe = Keyframe {
             frame_index: 0,
             timestamp_s: 0.0,
@@ -284,7 +282,7 @@ mod tests {
             features,
             landmarks: vec![None; 10],
         };
-        Map { keyframes: vec![keyframe; 3], landmarks: Vec::new() }
+        Map { keyframes: vec![keyframe; 3], ..Default::default() }
     }
 
     fn at(keyframe: usize, feature: usize) -> Sighting {

@@ -9,13 +9,9 @@ use super::matching::{Query, Rules, match_by_projection};
 use super::measurement::Trust;
 use crate::geometry::Pinhole;
 
-/// Keyframes with which landmarks are joined: those sharing most landmarks, and those nearby that share few or none (this closes
-/// small loops while the drift is still within the search radius).
+/// Keyframes with which landmarks are joined: those sharing most landmarks. What lies near but shares none is a matter for
+/// `loop_closing.rs`, which spreads the drift between the two instead of bending one over to the other.
 const JOINED_COVISIBLE: usize = 10;
-const JOINED_NEARBY: usize = 4;
-/// Nearby: within this share of the median depth, and looking within about 40° of the same direction.
-const NEARBY_SHARE: f64 = 0.5;
-const NEARBY_COSINE: f64 = 0.77;
 /// Search radius when joining, pixels at the finest level.
 const JOIN_RADIUS: f64 = 3.0;
 const JOIN_RULES: Rules = Rules { max_distance: 50, ratio: 1.0, check_rotation: false };
@@ -32,6 +28,7 @@ pub fn insert_keyframe(map: &mut Map, mut keyframe: Keyframe, pinhole: &Pinhole,
     let world_from_camera = keyframe.camera_from_world.inverse();
     keyframe.landmarks = vec![None; features.len()];
     map.keyframes.push(keyframe);
+    map.places.insert(id, &features.features);
     for (feature, landmark) in tracked.into_iter().enumerate() {
         if let Some(landmark) = landmark.and_then(|l| map.resolve(l)) {
             map.add_sighting(landmark, Sighting { keyframe: id, feature });
@@ -50,7 +47,7 @@ pub fn insert_keyframe(map: &mut Map, mut keyframe: Keyframe, pinhole: &Pinhole,
 
 /// Joins the landmarks of a keyframe with those of its neighbours, both ways.
 pub fn join_neighbours(map: &mut Map, keyframe: usize, pinhole: &Pinhole, config: &TrackingConfig) {
-    let neighbours = neighbours(map, keyframe);
+    let neighbours: Vec<usize> = map.covisible(keyframe).into_iter().take(JOINED_COVISIBLE).map(|(k, _)| k).collect();
     for other in &neighbours {
         let own: Vec<usize> = map.keyframes[keyframe].landmarks.iter().flatten().copied().collect();
         join(map, *other, &own, pinhole, config);
@@ -59,26 +56,8 @@ pub fn join_neighbours(map: &mut Map, keyframe: usize, pinhole: &Pinhole, config
     join(map, keyframe, &theirs, pinhole, config);
 }
 
-fn neighbours(map: &Map, keyframe: usize) -> Vec<usize> {
-    let covisible = map.covisible(keyframe);
-    let mut chosen: Vec<usize> = covisible.iter().take(JOINED_COVISIBLE).map(|(k, _)| *k).collect();
-    let this = &map.keyframes[keyframe];
-    let reach = NEARBY_SHARE * this.features.median_depth().or_else(|| map.median_depth(keyframe)).unwrap_or(1.0);
-    let mut nearby: Vec<(f64, usize)> = Vec::new();
-    for (k, other) in map.keyframes.iter().enumerate() {
-        let distance = (other.centre() - this.centre()).norm() / reach;
-        let cosine = other.forward().dot(&this.forward());
-        if k != keyframe && !chosen.contains(&k) && distance < 1.0 && cosine > NEARBY_COSINE {
-            nearby.push((distance + (1.0 - cosine), k));
-        }
-    }
-    nearby.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-    chosen.extend(nearby.into_iter().take(JOINED_NEARBY).map(|(_, k)| k));
-    chosen
-}
-
 /// Looks for `landmarks` in a keyframe: adds sightings, and merges where the feature found shows another landmark.
-fn join(map: &mut Map, keyframe: usize, landmarks: &[usize], pinhole: &Pinhole, config: &TrackingConfig) {
+pub fn join(map: &mut Map, keyframe: usize, landmarks: &[usize], pinhole: &Pinhole, config: &TrackingConfig) {
     let target = &map.keyframes[keyframe];
     let (mut asked, mut queries) = (Vec::new(), Vec::new());
     for l in landmarks {

@@ -165,7 +165,7 @@ mod tests {
     fn both_ways_find_the_true_matches_only() {
         let (first, second) = two_views();
         check(&match_all(&first, &[true; 400], &second, &RULES));
-        let frame = FrameFeatures::new(second, Vec::new(), &PINHOLE);
+        let frame = FrameFeatures::new(second, &PINHOLE);
         let queries: Vec<Query> = first
             .iter()
             .map(|f| Query {
@@ -186,7 +186,7 @@ mod tests {
     #[test]
     fn a_feature_goes_to_the_query_that_resembles_it_most() {
         let d = |bits: u32| Descriptor([(1u64 << bits) - 1, 0, 0, 0]);
-        let frame = FrameFeatures::new(vec![feature(50.0, 50.0, d(0))], Vec::new(), &PINHOLE);
+        let frame = FrameFeatures::new(vec![feature(50.0, 50.0, d(0))], &PINHOLE);
         let query = |bits| Query {
             pixel: Vector2::new(52.0, 50.0),
             radius: 5.0,

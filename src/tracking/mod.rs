@@ -15,12 +15,19 @@ mod frame_features;
 mod initialise;
 mod keyframe;
 mod localise;
+mod loop_alignment;
+mod loop_closing;
+#[cfg(test)]
+mod loop_closing_tests;
+mod loop_correction;
 mod map;
 mod mapping;
 mod matching;
 mod measurement;
 mod mono;
+mod places;
 mod pose;
+mod pose_graph;
 mod relocalise;
 mod spread;
 mod stereo;
@@ -54,7 +61,7 @@ pub struct TrackedFrame {
     pub inliers: usize,
     /// Set if this frame became a keyframe.
     pub keyframe: Option<NewKeyframe>,
-    /// Earlier keyframes that bundle adjustment moved: id, new world_from_camera.
+    /// Earlier keyframes that bundle adjustment or a closed loop moved: id, new world_from_camera.
     pub updates: Vec<(usize, Se3)>,
     /// Where the time went; the only part of the answer that differs from run to run.
     pub times: StageTimes,
@@ -99,11 +106,13 @@ pub struct StageTimes {
     pub mapping_ms: f64,
     /// Local bundle adjustment.
     pub bundle_ms: f64,
+    /// Looking for a loop, and closing it.
+    pub loops_ms: f64,
 }
 
 impl StageTimes {
     pub fn total_ms(&self) -> f64 {
-        self.features_ms + self.localise_ms + self.mapping_ms + self.bundle_ms
+        self.features_ms + self.localise_ms + self.mapping_ms + self.bundle_ms + self.loops_ms
     }
 }
 

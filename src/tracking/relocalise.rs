@@ -1,5 +1,5 @@
 //! Finding a pose without a prediction: descriptors against a known view, PnP with RANSAC (OpenCV's, whose random numbers have a fixed
-//! seed), and keyframes ranked by how much their thumbnail resembles the frame's (Klein & Murray, ECCV 2008).
+//! seed), and the keyframes that are worth trying.
 
 use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
 use opencv::calib3d;
@@ -85,13 +85,9 @@ fn solve_pnp(
     Ok(Some((pose, inliers.data_typed::<i32>()?.iter().map(|i| *i as usize).collect())))
 }
 
-/// The `count` keyframes whose thumbnails resemble the frame's most, best first.
+/// The `count` keyframes that resemble the frame most, best first.
 pub fn similar_keyframes(map: &Map, frame: &FrameFeatures, count: usize) -> Vec<usize> {
-    let resemblance =
-        |k: usize| -> f32 { map.keyframes[k].features.thumbnail.iter().zip(&frame.thumbnail).map(|(a, b)| a * b).sum() };
-    let mut ranked: Vec<(f32, usize)> = (0..map.keyframes.len()).map(|k| (resemblance(k), k)).collect();
-    ranked.sort_by(|a, b| b.0.total_cmp(&a.0).then(b.1.cmp(&a.1)));
-    ranked.into_iter().take(count).map(|(_, k)| k).collect()
+    map.places.query(&frame.features).into_iter().take(count).map(|found| found.keyframe).collect()
 }
 
 #[cfg(test)]
@@ -117,7 +113,7 @@ mod tests {
             let wrong = if i % 3 == 0 { Vector2::new(100.0 * random.f64() + 20.0, 50.0) } else { Vector2::zeros() };
             seen.push(feature(pixel.x + wrong.x, pixel.y + wrong.y, descriptor));
         }
-        let frame = FrameFeatures::new(seen, Vec::new(), &PINHOLE);
+        let frame = FrameFeatures::new(seen, &PINHOLE);
         let found = pose_from_view(&view, &points, &frame, &PINHOLE).unwrap();
         assert!(se3::log(&(found.camera_from_world * truth.inverse())).norm() < 1e-3);
         assert!(found.matches.len() >= 95 && found.matches.iter().all(|m| m.query % 3 != 0));

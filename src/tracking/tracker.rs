@@ -1,6 +1,6 @@
 //! The tracker: one frame at a time to a pose, and now and then a keyframe. Owns the map; runs in the caller's thread.
 //!
-//! It leaves out what the rest of the project does elsewhere or not at all: loop closing over large drift, and rendering.
+//! It leaves out what the rest of the project does elsewhere: rendering.
 
 mod start;
 mod without_features;
@@ -13,6 +13,7 @@ use super::features::Extractor;
 use super::frame_features::{FrameFeatures, luma};
 use super::keyframe;
 use super::localise::{Context, Localised};
+use super::loop_closing::LoopCloser;
 use super::map::{Keyframe, Map};
 use super::mono::FirstView;
 use super::{
@@ -41,6 +42,7 @@ pub struct Tracker {
     config: TrackingConfig,
     extractor: Extractor,
     map: Map,
+    loops: LoopCloser,
     /// The last frame with a pose; `None` before the map is started.
     last: Option<LastFrame>,
     /// The frame that a map without depth may start from.
@@ -98,6 +100,7 @@ impl Tracker {
             extractor: Extractor::new(camera.pinhole.width, camera.pinhole.height, &config),
             config,
             map: Map::default(),
+            loops: LoopCloser::default(),
             last: None,
             first_view: None,
             velocity: None,
@@ -291,8 +294,13 @@ impl Tracker {
         times.mapping_ms = milliseconds(clock);
         let clock = Instant::now();
         // A keyframe that few landmarks hold would be torn from where its pixels put it.
-        let moved = if held_by_landmarks { window::adjust_window(&mut self.map, id, pinhole, config) } else { Vec::new() };
+        let mut moved = if held_by_landmarks { window::adjust_window(&mut self.map, id, pinhole, config) } else { Vec::new() };
         times.bundle_ms = milliseconds(clock);
+        let clock = Instant::now();
+        if let Some(bent) = self.close_loop(id) {
+            moved = bent;
+        }
+        times.loops_ms = milliseconds(clock);
         let pose = |k: usize| self.map.keyframes[k].camera_from_world;
         let updates = moved.into_iter().filter(|k| *k != id).map(|k| (k, pose(k).inverse())).collect();
         let camera_from_world = pose(id);
@@ -312,6 +320,17 @@ impl Tracker {
         };
         let world_from_camera = keyframe.camera_from_world.inverse();
         NewKeyframe { id, world_from_camera, seen, covisible: self.map.covisible(id) }
+    }
+
+    /// Closes a loop if the newest keyframe shows one: returns the keyframes that may have moved. Frames follow their keyframes.
+    fn close_loop(&mut self, keyframe: usize) -> Option<Vec<usize>> {
+        let moved =
+            self.config.loop_closing.then(|| self.loops.close(&mut self.map, keyframe, &self.camera.pinhole, &self.config))?;
+        for (keyframe, growth) in &moved {
+            let theirs = self.records.iter_mut().filter(|r| r.reference == *keyframe);
+            theirs.for_each(|r| r.camera_from_reference.translation.vector *= *growth);
+        }
+        (!moved.is_empty()).then(|| moved.into_iter().map(|(k, _)| k).collect())
     }
 
     fn record(&mut self, frame: &Frame, reference: usize, camera_from_reference: Se3) {

@@ -18,13 +18,19 @@ const MAX_FIXED: usize = 40;
 /// Adjusts the window around `keyframe`; returns the keyframes that may have moved, in ascending order.
 pub fn adjust_window(map: &mut Map, keyframe: usize, pinhole: &Pinhole, config: &TrackingConfig) -> Vec<usize> {
     let (free, fixed) = choose_window(map, keyframe, config);
+    adjust(map, &free, &fixed, pinhole, config)
+}
+
+/// Adjusts the keyframes `free` and all their landmarks, held in place by `fixed`; returns `free` in ascending order, or nothing if
+/// nothing was done.
+pub fn adjust(map: &mut Map, free: &[usize], fixed: &[usize], pinhole: &Pinhole, config: &TrackingConfig) -> Vec<usize> {
     if free.is_empty() || config.bundle_iterations == 0 {
         return Vec::new();
     }
-    let all_landmarks = map.landmarks_of(&free);
+    let all_landmarks = map.landmarks_of(free);
     let (landmarks, single): (Vec<usize>, Vec<usize>) =
         all_landmarks.into_iter().partition(|l| map.landmarks[*l].sightings.len() > 1);
-    let keyframes: Vec<usize> = free.iter().chain(&fixed).copied().collect();
+    let keyframes: Vec<usize> = free.iter().chain(fixed).copied().collect();
     let (mut problem, sightings) = make_problem(map, &keyframes, free.len(), &landmarks, config);
     problem.solve(pinhole, config.bundle_iterations);
     problem.judge(pinhole);
@@ -54,7 +60,7 @@ pub fn adjust_window(map: &mut Map, keyframe: usize, pinhole: &Pinhole, config: 
     for l in &landmarks {
         map.refresh_geometry(*l, config);
     }
-    let mut moved = free;
+    let mut moved = free.to_vec();
     moved.sort_unstable();
     moved
 }

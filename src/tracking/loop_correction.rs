@@ -1,0 +1,109 @@
+//! What a closed loop does to the map: the drift is spread over the keyframes by a pose graph, landmarks follow the keyframe that saw
+//! them first, what turned out to be the same is joined, and a bundle adjustment of all keyframes settles the rest where they are few
+//! enough (Mur-Artal, Montiel & Tardós, *ORB-SLAM*, 2015: the *essential graph*; its global adjustment).
+
+use super::TrackingConfig;
+use super::loop_closing::{CONNECTED_SHARED, Moved, Recognised};
+use super::map::{Fate, Map, Sighting};
+use super::mapping::join;
+use super::pose_graph::{Edge, PoseGraph};
+use super::window::adjust;
+use crate::geometry::sim3::Vector7;
+use crate::geometry::{Pinhole, Se3, Sim3};
+
+/// Keyframes that share this many landmarks are held to their relative pose, besides each one and the one it shares most with.
+const STRONG_SHARED: usize = 100;
+const STRONG_NEIGHBOURS: usize = 5;
+/// Standard deviation of the relative pose of two keyframes that share [`STRONG_SHARED`] landmarks, metres at a metre's distance and
+/// radians, and of the logarithm of their scales. Only their ratios matter, and how they compare with [`DOUBT`].
+const SIGMA_TRANSLATION: f64 = 0.003;
+const SIGMA_ROTATION_RAD: f64 = 0.002;
+const SIGMA_SCALE: f64 = 0.005;
+/// Loops that disagree by more than this many standard deviations pull less and less.
+const DOUBT: f64 = 10.0;
+const GRAPH_STEPS: usize = 30;
+/// Neighbours of the keyframe in which the place's landmarks are joined with theirs.
+const JOINED_NEIGHBOURS: usize = 10;
+/// Keyframes that one adjustment may move: its equations are dense in them.
+const MAX_ADJUSTED: usize = 100;
+
+/// Closes a recognised loop; `edges` are those of earlier loops and get this one's. Returns the keyframes that may have moved.
+pub fn correct(
+    map: &mut Map,
+    found: &Recognised,
+    edges: &mut Vec<Edge>,
+    scale_is_free: bool,
+    pinhole: &Pinhole,
+    config: &TrackingConfig,
+) -> Vec<Moved> {
+    let before: Vec<Se3> = map.keyframes.iter().map(|k| k.camera_from_world).collect();
+    let keyframe_from_place = found.corrected * Sim3::from(before[found.place]).inverse();
+    let depth = map.keyframes[found.keyframe].features.median_depth().unwrap_or(1.0);
+    let mut graph = PoseGraph { poses: before.iter().map(|p| Sim3::from(*p)).collect(), edges: Vec::new(), scale_is_free };
+    graph.edges = skeleton(map, depth);
+    edges.push(Edge { doubt: Some(DOUBT), ..edge(found.keyframe, found.place, keyframe_from_place, found.matches.len(), depth) });
+    graph.edges.extend(edges.iter());
+    graph.optimise(GRAPH_STEPS);
+    move_map(map, &before, &graph.poses, config);
+    let neighbours: Vec<usize> =
+        map.covisible(found.keyframe).into_iter().filter(|(_, n)| *n >= CONNECTED_SHARED).map(|(k, _)| k).collect();
+    take_over(map, found, config);
+    join(map, found.keyframe, &found.landmarks, pinhole, config);
+    for neighbour in neighbours.into_iter().take(JOINED_NEIGHBOURS) {
+        join(map, neighbour, &found.landmarks, pinhole, config);
+    }
+    let all: Vec<usize> = (1..map.keyframes.len()).collect();
+    if all.len() <= MAX_ADJUSTED {
+        adjust(map, &all, &[0], pinhole, config);
+    }
+    graph.poses.iter().enumerate().skip(1).map(|(k, pose)| (k, 1.0 / pose.scale)).collect()
+}
+
+/// The edges that hold the map together: each keyframe with the older one that it shares most with, and with others if that is much.
+fn skeleton(map: &Map, depth: f64) -> Vec<Edge> {
+    let mut edges = Vec::new();
+    for a in 1..map.keyframes.len() {
+        let older: Vec<(usize, usize)> = map.covisible(a).into_iter().filter(|(b, _)| *b < a).take(STRONG_NEIGHBOURS).collect();
+        let (parent, shared) = older.first().copied().unwrap_or((a - 1, 1));
+        let strong = older.into_iter().skip(1).filter(|(_, shared)| *shared >= STRONG_SHARED);
+        for (b, shared) in std::iter::once((parent, shared)).chain(strong) {
+            let a_from_b = map.keyframes[a].camera_from_world * map.keyframes[b].camera_from_world.inverse();
+            edges.push(edge(a, b, Sim3::from(a_from_b), shared, depth));
+        }
+    }
+    edges
+}
+
+fn edge(a: usize, b: usize, a_from_b: Sim3, shared: usize, depth: f64) -> Edge {
+    let certainty = (shared as f64 / STRONG_SHARED as f64).sqrt();
+    let (t, r) = (certainty / (SIGMA_TRANSLATION * depth), certainty / SIGMA_ROTATION_RAD);
+    let weights = Vector7::from_column_slice(&[t, t, t, r, r, r, certainty / SIGMA_SCALE]);
+    Edge { a, b, a_from_b, weights, doubt: None }
+}
+
+/// Keyframes to their new poses; each landmark goes with the keyframe that saw it first.
+fn move_map(map: &mut Map, before: &[Se3], after: &[Sim3], config: &TrackingConfig) {
+    for landmark in map.landmarks.iter_mut().filter(|l| l.fate == Fate::Alive) {
+        let Some(anchor) = landmark.sightings.first().map(|s| s.keyframe) else { continue };
+        landmark.position = after[anchor].inverse().act(&(before[anchor] * landmark.position));
+    }
+    for (keyframe, pose) in map.keyframes.iter_mut().zip(after) {
+        keyframe.camera_from_world = pose.to_rigid();
+    }
+    for l in 0..map.landmarks.len() {
+        map.refresh_geometry(l, config);
+    }
+}
+
+/// The place's landmarks take over what the keyframe's features showed.
+fn take_over(map: &mut Map, found: &Recognised, config: &TrackingConfig) {
+    for (landmark, feature) in &found.matches {
+        let Some(landmark) = map.resolve(*landmark) else { continue };
+        match map.keyframes[found.keyframe].landmarks[*feature] {
+            Some(own) => map.merge(own, landmark),
+            None => map.add_sighting(landmark, Sighting { keyframe: found.keyframe, feature: *feature }),
+        }
+        map.refresh_descriptor(landmark);
+        map.refresh_geometry(landmark, config);
+    }
+}
