@@ -10,7 +10,7 @@ use indicatif::ProgressBar;
 use keysplat::config::{Config, SequenceConfig};
 use keysplat::gpu::Gpu;
 use keysplat::pipeline::{self, Outcome, PipelineError, Progress, outputs};
-use keysplat::sequence::{Layout, SensorKind, Sequence};
+use keysplat::sequence::{Layout, Sensor, SensorKind, Sequence};
 use miette::{IntoDiagnostic, miette};
 
 use super::{Verbosity, print_metrics, progress};
@@ -116,6 +116,7 @@ pub fn replay(mut config: Config, out: PathBuf, stop: Arc<AtomicBool>, verbosity
     outputs::prepare_folder(&out).into_diagnostic()?;
     tracing::info!(
         sequence = sequence.name,
+        sensor = %sequence.sensor.kind(),
         frames = sequence.entries.len(),
         adapter = gpu.adapter.name,
         "replaying into {}",
@@ -134,7 +135,7 @@ pub fn replay(mut config: Config, out: PathBuf, stop: Arc<AtomicBool>, verbosity
     .into_diagnostic()?;
     let error = outcome.error.take();
     if outcome.poses.is_empty() {
-        return nothing_made(error, windows.stopped());
+        return nothing_made(sequence.sensor, error, windows.stopped());
     }
     let finished = write_and_measure((&sequence, config), &gpu, &outcome, &out, verbosity);
     match (error, finished) {
@@ -161,13 +162,17 @@ fn write_and_measure(
 }
 
 /// Without a pose there is no trajectory, no map and no figure; what an earlier run left in the folder stays.
-fn nothing_made(error: Option<PipelineError>, stopped: bool) -> miette::Result<()> {
+fn nothing_made(sensor: Sensor, error: Option<PipelineError>, stopped: bool) -> miette::Result<()> {
     match error {
         Some(error) => Err(miette!("{error}")),
         None if stopped => {
             tracing::warn!("stopped before a frame was tracked, so nothing was written");
             Ok(())
         }
+        None if sensor == Sensor::Mono => Err(miette!(
+            "not one frame could be tracked; the recording was replayed as mono, which needs texture and a camera that moves \
+             sideways; if it has depth, check that its depth.txt, or its depth folder, is there"
+        )),
         None => Err(miette!(
             "not one frame could be tracked; the images need texture, and depth between tracking.min_depth_metres and \
              tracking.max_depth_metres"
