@@ -90,9 +90,18 @@ struct Level {
 impl Level {
     fn new(frame: &DenseFrame, halvings: u32) -> Self {
         let step = 1usize << halvings;
-        let pinhole = frame.pinhole.scaled(1.0 / step as f64);
+        // Whole blocks only; what remains at the right and lower border is left out.
+        let (full, s) = (frame.pinhole, 1.0 / step as f64);
+        let pinhole = Pinhole {
+            fx: full.fx * s,
+            fy: full.fy * s,
+            cx: (full.cx + 0.5) * s - 0.5,
+            cy: (full.cy + 0.5) * s - 0.5,
+            width: full.width >> halvings,
+            height: full.height >> halvings,
+        };
         let (width, height) = (pinhole.width as usize, pinhole.height as usize);
-        let full = frame.pinhole.width as usize;
+        let full = full.width as usize;
         let (mut grey, mut points) = (Vec::with_capacity(width * height), Vec::with_capacity(width * height));
         for i in 0..width * height {
             let (x, y) = (i % width, i / width);
@@ -316,6 +325,10 @@ mod tests {
         let reference = corner(&Se3::identity());
         let elsewhere = corner(&se3::exp(&Vector6::new(0.0, 0.0, 0.0, 0.0, 2.4, 0.0)));
         assert!(align(&reference, &elsewhere, &[Se3::identity()]).is_none());
+        // Sizes that halve to nothing whole.
+        let odd = Pinhole { width: 45, height: 31, ..PINHOLE.scaled(0.07) };
+        let small = DenseFrame { depth: vec![2.0; 45 * 31], grey: vec![100.0; 45 * 31], pinhole: odd };
+        assert!(align(&small, &small, &[Se3::identity()]).is_none());
         // A blank wall says nothing about sliding along it.
         let wall = DenseFrame { depth: vec![2.0; 160 * 120], grey: vec![100.0; 160 * 120], pinhole: PINHOLE.scaled(SCALE) };
         assert!(align(&wall, &wall, &[Se3::identity()]).is_none());
