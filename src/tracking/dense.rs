@@ -28,6 +28,8 @@ const CONVERGED: f64 = 1e-6;
 const MIN_AGREEMENT: f64 = 0.55;
 /// And of all points.
 const MIN_OVERLAP: f64 = 0.3;
+/// Correlation of the two frames' brightness that says they show one place: flat walls fit each other anywhere.
+const MIN_RESEMBLANCE: f64 = 0.6;
 /// The least information about any direction of motion, per point: (1/m)² or (1/rad)² over the squared residuals' scale.
 const MIN_INFORMATION: f64 = 0.05;
 
@@ -186,7 +188,8 @@ pub fn align(reference: &DenseFrame, current: &DenseFrame, guesses: &[Se3]) -> O
         let agreement = sums.agree as f64 / sums.in_view.max(1) as f64;
         let overlap = sums.agree as f64 / sums.points.max(1) as f64;
         let information = SymmetricEigen::new(sums.hessian / sums.agree.max(1) as f64).eigenvalues.min();
-        let held = agreement >= MIN_AGREEMENT && overlap >= MIN_OVERLAP && information >= MIN_INFORMATION;
+        let alike = resemblance(reference, current, &pose) >= MIN_RESEMBLANCE;
+        let held = alike && agreement >= MIN_AGREEMENT && overlap >= MIN_OVERLAP && information >= MIN_INFORMATION;
         let cost = sums.cost / sums.in_view.max(1) as f64;
         if held && best.as_ref().is_none_or(|(least, _)| cost < *least) {
             best = Some((cost, Aligned { current_from_reference: pose, overlap }));
@@ -257,6 +260,25 @@ impl Sums {
 fn by_pose(p: &Vector3<f64>, g: &Vector3<f64>) -> Vector6<f64> {
     let turn = p.cross(g);
     Vector6::new(g.x, g.y, g.z, turn.x, turn.y, turn.z)
+}
+
+/// Correlation of the reference's brightness with what the current frame shows there; 0 where either is blank.
+fn resemblance(reference: &Level, current: &Level, pose: &Se3) -> f64 {
+    let mut pairs: Vec<(f64, f64)> = Vec::new();
+    for (point, grey) in reference.points.iter().zip(&reference.grey) {
+        let Some(point) = point else { continue };
+        let p = pose * nalgebra::Point3::from(*point);
+        let Some(pixel) = current.pinhole.project(&p.coords) else { continue };
+        pairs.extend(current.brightness(pixel.x, pixel.y).map(|(value, ..)| (*grey, value)));
+    }
+    let count = pairs.len().max(1) as f64;
+    let (a, b) = pairs.iter().fold((0.0, 0.0), |s, p| (s.0 + p.0 / count, s.1 + p.1 / count));
+    let (aa, bb, ab) = pairs.iter().fold((0.0, 0.0, 0.0), |s, p| {
+        let (x, y) = (p.0 - a, p.1 - b);
+        (s.0 + x * x, s.1 + y * y, s.2 + x * y)
+    });
+    // A grey level or two is noise.
+    if aa < count || bb < count { 0.0 } else { ab / (aa * bb).sqrt() }
 }
 
 /// Median difference in brightness: the exposure may have changed.
