@@ -7,7 +7,7 @@ use keysplat::bench::{BenchScene, Rates, StepBench, StepReport, bench_step, meas
 use keysplat::config::Config;
 use keysplat::export::MapFormat;
 use keysplat::geometry::{Pinhole, Se3, Trajectory};
-use keysplat::gpu::{AdapterSummary, Gpu};
+use keysplat::gpu::{AdapterSummary, Gpu, GpuError};
 use keysplat::pipeline::outputs;
 use keysplat::render::BlendForm;
 use keysplat::sequence::{RectifiedImage, Rectifier};
@@ -81,6 +81,8 @@ struct Report {
     version: &'static str,
     rates: Rates,
     steps: Vec<StepReport>,
+    /// Scenes that the adapter cannot hold.
+    too_large: Vec<StepBench>,
 }
 
 pub fn bench(args: &BenchArgs) -> miette::Result<()> {
@@ -103,17 +105,27 @@ fn step(args: &StepArgs) -> miette::Result<()> {
         version: env!("CARGO_PKG_VERSION"),
         rates,
         steps: Vec::new(),
+        too_large: Vec::new(),
     };
     if !args.json {
         println!("{} [{}, {}]", gpu.adapter.name, gpu.adapter.kind, gpu.adapter.driver);
         println!("copy {:.1} GB/s   multiply-add {:.1} GFLOP/s", rates.bytes_per_s * 1e-9, rates.flops_per_s * 1e-9);
     }
-    let mut measure = |scene: BenchScene, bench: StepBench| {
-        let measured = bench_step(&gpu, scene, &bench, &rates).into_diagnostic()?;
-        if !args.json {
-            print(&measured);
+    let mut measure = |scene: Result<BenchScene, GpuError>, bench: StepBench| {
+        // A scene that the adapter cannot hold is noted, and the others are measured.
+        match scene.and_then(|scene| bench_step(&gpu, scene, &bench, &rates)) {
+            Ok(measured) => {
+                if !args.json {
+                    print(&measured);
+                }
+                report.steps.push(measured);
+            }
+            Err(refused @ GpuError::TooLarge { .. }) => {
+                tracing::warn!(gaussians = bench.gaussians, size = %format!("{}x{}", bench.width, bench.height), sh = bench.sh_degree.get(), "not measured: {refused}");
+                report.too_large.push(bench);
+            }
+            Err(error) => return Err(error).into_diagnostic(),
         }
-        report.steps.push(measured);
         Ok::<_, miette::Report>(())
     };
     let recorded = args.run.as_deref().map(RecordedView::open).transpose()?;
@@ -123,7 +135,7 @@ fn step(args: &StepArgs) -> miette::Result<()> {
             let Pinhole { width, height, .. } = view.image.pinhole;
             let camera = ViewCamera { pinhole: view.image.pinhole, camera_from_world: view.world_from_camera.inverse() };
             let depth = view.image.depth.as_ref().map(|depth| depth.metres.as_slice());
-            let scene = BenchScene::of_map(&gpu, &cloud, camera, (&view.image.color, depth)).into_diagnostic()?;
+            let scene = BenchScene::of_map(&gpu, &cloud, camera, (&view.image.color, depth));
             let sh_degree = cloud.sh_degree;
             measure(scene, StepBench { gaussians: cloud.len(), width, height, sh_degree, form, steps: args.steps })?;
             continue;
@@ -131,7 +143,7 @@ fn step(args: &StepArgs) -> miette::Result<()> {
         for &(width, height) in &args.size {
             for &degree in &args.sh {
                 let sh_degree = ShDegree::new(degree).ok_or_else(|| miette!("--sh takes degrees 0 to 3, not {degree}"))?;
-                let scene = BenchScene::new(&gpu, gaussians, (width, height), sh_degree).into_diagnostic()?;
+                let scene = BenchScene::new(&gpu, gaussians, (width, height), sh_degree);
                 measure(scene, StepBench { gaussians, width, height, sh_degree, form, steps: args.steps })?;
             }
         }
