@@ -67,6 +67,15 @@ enum Form {
     Narrow,
 }
 
+impl From<Form> for BlendForm {
+    fn from(form: Form) -> Self {
+        match form {
+            Form::Wide => Self::Wide,
+            Form::Narrow => Self::Narrow,
+        }
+    }
+}
+
 fn parse_size(text: &str) -> Result<(u32, u32), String> {
     let wrong = || format!("`{text}` is no size; write WIDTHxHEIGHT, like 640x480");
     let (width, height) = text.split_once('x').ok_or_else(wrong)?;
@@ -94,11 +103,7 @@ pub fn bench(args: &BenchArgs) -> miette::Result<()> {
 fn step(args: &StepArgs) -> miette::Result<()> {
     let gpu = Gpu::open_profiled(args.adapter.as_deref()).into_diagnostic()?;
     let rates = measure_rates(&gpu).into_diagnostic()?;
-    let form = match args.form {
-        None => BlendForm::of(&gpu),
-        Some(Form::Wide) => BlendForm::Wide,
-        Some(Form::Narrow) => BlendForm::Narrow,
-    };
+    let form = args.form.map_or(BlendForm::of(&gpu), BlendForm::from);
     let mut report = Report {
         adapter: gpu.adapter.clone(),
         cpu: keysplat::evaluation::machine::cpu_name(),
@@ -121,7 +126,7 @@ fn step(args: &StepArgs) -> miette::Result<()> {
                 report.steps.push(measured);
             }
             Err(refused @ GpuError::TooLarge { .. }) => {
-                tracing::warn!(gaussians = bench.gaussians, size = %format!("{}x{}", bench.width, bench.height), sh = bench.sh_degree.get(), "not measured: {refused}");
+                tracing::warn!(?bench, "not measured: {refused}");
                 report.too_large.push(bench);
             }
             Err(error) => return Err(error).into_diagnostic(),

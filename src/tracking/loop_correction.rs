@@ -38,7 +38,7 @@ pub fn correct(
 ) -> Vec<Moved> {
     let before: Vec<Se3> = map.keyframes.iter().map(|k| k.camera_from_world).collect();
     let keyframe_from_place = found.corrected * Sim3::from(before[found.place]).inverse();
-    let depth = map.keyframes[found.keyframe].features.median_depth().unwrap_or(1.0);
+    let depth = map.keyframes[found.keyframe].features.median_depth().or_else(|| map.median_depth(found.keyframe)).unwrap_or(1.0);
     let mut graph = PoseGraph { poses: before.iter().map(|p| Sim3::from(*p)).collect(), edges: Vec::new(), scale_is_free };
     graph.edges = skeleton(map, depth);
     edges.push(Edge { doubt: Some(DOUBT), ..edge(found.keyframe, found.place, keyframe_from_place, found.matches.len(), depth) });
