@@ -12,12 +12,7 @@
 @group(0) @binding(6) var<storage, read_write> image_gradients: array<vec4<f32>>;
 
 // (by mean, by square, by product) of one channel filtered along rows: [26 rows, 16 columns].
-var<workgroup> rows: array<vec3<f32>, 416>;
-
-// Filtered partials of four outputs.
-struct Partials {
-    at: array<vec3<f32>, 4>,
-}
+var<workgroup> rows: array<vec4<f32>, 416>;
 
 // A workgroup covers 16×16 pixels.
 @compute @workgroup_size(64)
@@ -45,9 +40,9 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
             filter_row(corner + item / 4u * stride + item % 4u * 4u, item * 4u);
         }
         workgroupBarrier();
-        let filtered = filter_column(column, row);
+        let filtered = filter_column(row * 16u + column);
         for (var k = 0u; k < end; k++) {
-            let ssim = dot(filtered.at[k], vec3(1.0, 2.0 * rendered[k][channel], wanted[k][channel]));
+            let ssim = dot(filtered.at[k].xyz, vec3(1.0, 2.0 * rendered[k][channel], wanted[k][channel]));
             let l1 = sign(rendered[k][channel] - wanted[k][channel]);
             gradient[k][channel] = ((1.0 - setup.ssim_weight) * l1 - setup.ssim_weight * ssim) * per_pixel / 3.0;
         }
@@ -66,59 +61,24 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
     }
 }
 
-fn add(sum: ptr<function, Partials>, value: vec3<f32>, taps: vec4<f32>) {
-    if taps.x != 0.0 {
-        (*sum).at[0] += taps.x * value;
-    }
-    if taps.y != 0.0 {
-        (*sum).at[1] += taps.y * value;
-    }
-    if taps.z != 0.0 {
-        (*sum).at[2] += taps.z * value;
-    }
-    if taps.w != 0.0 {
-        (*sum).at[3] += taps.w * value;
-    }
-}
-
 // Four outputs along a row, from the partials at `at` on, to `rows[to]` on.
 fn filter_row(at: u32, to: u32) {
-    var sum: Partials;
-    add(&sum, partials[at + 0u].xyz, T0);
-    add(&sum, partials[at + 1u].xyz, T1);
-    add(&sum, partials[at + 2u].xyz, T2);
-    add(&sum, partials[at + 3u].xyz, T3);
-    add(&sum, partials[at + 4u].xyz, T4);
-    add(&sum, partials[at + 5u].xyz, T5);
-    add(&sum, partials[at + 6u].xyz, T6);
-    add(&sum, partials[at + 7u].xyz, T7);
-    add(&sum, partials[at + 8u].xyz, T8);
-    add(&sum, partials[at + 9u].xyz, T9);
-    add(&sum, partials[at + 10u].xyz, T10);
-    add(&sum, partials[at + 11u].xyz, T11);
-    add(&sum, partials[at + 12u].xyz, T12);
-    add(&sum, partials[at + 13u].xyz, T13);
+    var sum: Filtered;
+    add(&sum, partials[at + 0u], T0);
+    add(&sum, partials[at + 1u], T1);
+    add(&sum, partials[at + 2u], T2);
+    add(&sum, partials[at + 3u], T3);
+    add(&sum, partials[at + 4u], T4);
+    add(&sum, partials[at + 5u], T5);
+    add(&sum, partials[at + 6u], T6);
+    add(&sum, partials[at + 7u], T7);
+    add(&sum, partials[at + 8u], T8);
+    add(&sum, partials[at + 9u], T9);
+    add(&sum, partials[at + 10u], T10);
+    add(&sum, partials[at + 11u], T11);
+    add(&sum, partials[at + 12u], T12);
+    add(&sum, partials[at + 13u], T13);
     for (var k = 0u; k < 4u; k++) {
         rows[to + k] = sum.at[k];
     }
-}
-
-fn filter_column(column: u32, first: u32) -> Partials {
-    let at = first * 16u + column;
-    var sum: Partials;
-    add(&sum, rows[at + 0u], T0);
-    add(&sum, rows[at + 16u], T1);
-    add(&sum, rows[at + 32u], T2);
-    add(&sum, rows[at + 48u], T3);
-    add(&sum, rows[at + 64u], T4);
-    add(&sum, rows[at + 80u], T5);
-    add(&sum, rows[at + 96u], T6);
-    add(&sum, rows[at + 112u], T7);
-    add(&sum, rows[at + 128u], T8);
-    add(&sum, rows[at + 144u], T9);
-    add(&sum, rows[at + 160u], T10);
-    add(&sum, rows[at + 176u], T11);
-    add(&sum, rows[at + 192u], T12);
-    add(&sum, rows[at + 208u], T13);
-    return sum;
 }

@@ -20,11 +20,6 @@ const C2: f32 = 0.0009;
 var<workgroup> rows: array<vec4<f32>, 864>;
 var<workgroup> sums: array<vec4<f32>, 32>;
 
-// Filtered (x, y, x² + y², xy) of four outputs: SSIM needs the variances' sum only.
-struct Moments {
-    at: array<vec4<f32>, 4>,
-}
-
 struct Ssim {
     value: vec4<f32>,
     by_mean: vec4<f32>,
@@ -50,9 +45,9 @@ fn main(
     let x = first.x + column;
     let y = first.y + row;
     let ssim = array<Ssim, 3>(
-        ssim_of(filter_column(0u, column, row)),
-        ssim_of(filter_column(1u, column, row)),
-        ssim_of(filter_column(2u, column, row)),
+        ssim_of(filter_column(row * 16u + column)),
+        ssim_of(filter_column(288u + row * 16u + column)),
+        ssim_of(filter_column(576u + row * 16u + column)),
     );
     let stride = bordered(setup.width);
     let plane = stride * bordered(setup.height);
@@ -89,22 +84,7 @@ fn main(
     }
 }
 
-fn add(sum: ptr<function, Moments>, value: vec4<f32>, taps: vec4<f32>) {
-    // The taps are constants: a zero one costs nothing.
-    if taps.x != 0.0 {
-        (*sum).at[0] += taps.x * value;
-    }
-    if taps.y != 0.0 {
-        (*sum).at[1] += taps.y * value;
-    }
-    if taps.z != 0.0 {
-        (*sum).at[2] += taps.z * value;
-    }
-    if taps.w != 0.0 {
-        (*sum).at[3] += taps.w * value;
-    }
-}
-
+// What SSIM needs of a pixel; of the variances only their sum.
 fn quantities(x: f32, y: f32) -> vec4<f32> {
     return vec4(x, y, x * x + y * y, x * y);
 }
@@ -113,9 +93,9 @@ fn quantities(x: f32, y: f32) -> vec4<f32> {
 fn add_pixel(
     x: i32,
     y: i32,
-    red: ptr<function, Moments>,
-    green: ptr<function, Moments>,
-    blue: ptr<function, Moments>,
+    red: ptr<function, Filtered>,
+    green: ptr<function, Filtered>,
+    blue: ptr<function, Filtered>,
     taps: vec4<f32>,
 ) {
     let inside = x >= 0 && y >= 0 && x < i32(setup.width) && y < i32(setup.height);
@@ -131,9 +111,9 @@ fn add_pixel(
 fn filter_row(first: vec2<u32>, row: u32, column: u32) {
     let x = i32(first.x + column) - i32(RADIUS);
     let y = i32(first.y + row) - i32(RADIUS);
-    var red: Moments;
-    var green: Moments;
-    var blue: Moments;
+    var red: Filtered;
+    var green: Filtered;
+    var blue: Filtered;
     add_pixel(x + 0, y, &red, &green, &blue, T0);
     add_pixel(x + 1, y, &red, &green, &blue, T1);
     add_pixel(x + 2, y, &red, &green, &blue, T2);
@@ -156,28 +136,7 @@ fn filter_row(first: vec2<u32>, row: u32, column: u32) {
     }
 }
 
-// Four outputs of one column, from row `first` of the tile on.
-fn filter_column(channel: u32, column: u32, first: u32) -> Moments {
-    let at = channel * 288u + first * 16u + column;
-    var sum: Moments;
-    add(&sum, rows[at + 0u], T0);
-    add(&sum, rows[at + 16u], T1);
-    add(&sum, rows[at + 32u], T2);
-    add(&sum, rows[at + 48u], T3);
-    add(&sum, rows[at + 64u], T4);
-    add(&sum, rows[at + 80u], T5);
-    add(&sum, rows[at + 96u], T6);
-    add(&sum, rows[at + 112u], T7);
-    add(&sum, rows[at + 128u], T8);
-    add(&sum, rows[at + 144u], T9);
-    add(&sum, rows[at + 160u], T10);
-    add(&sum, rows[at + 176u], T11);
-    add(&sum, rows[at + 192u], T12);
-    add(&sum, rows[at + 208u], T13);
-    return sum;
-}
-
-fn ssim_of(m: Moments) -> Ssim {
+fn ssim_of(m: Filtered) -> Ssim {
     let mean_x = vec4(m.at[0].x, m.at[1].x, m.at[2].x, m.at[3].x);
     let mean_y = vec4(m.at[0].y, m.at[1].y, m.at[2].y, m.at[3].y);
     let squares = vec4(m.at[0].z, m.at[1].z, m.at[2].z, m.at[3].z);

@@ -25,6 +25,47 @@ const T11 = vec4(0.0, W0, W1, W2);
 const T12 = vec4(0.0, 0.0, W0, W1);
 const T13 = vec4(0.0, 0.0, 0.0, W0);
 
+// Filtered quantities of four outputs side by side.
+struct Filtered {
+    at: array<vec4<f32>, 4>,
+}
+
+fn add(sum: ptr<function, Filtered>, value: vec4<f32>, taps: vec4<f32>) {
+    // The taps are constants: a zero one costs nothing.
+    if taps.x != 0.0 {
+        (*sum).at[0] += taps.x * value;
+    }
+    if taps.y != 0.0 {
+        (*sum).at[1] += taps.y * value;
+    }
+    if taps.z != 0.0 {
+        (*sum).at[2] += taps.z * value;
+    }
+    if taps.w != 0.0 {
+        (*sum).at[3] += taps.w * value;
+    }
+}
+
+// Four outputs of one column of `rows`, which each pass declares: [rows, 16 columns], filtered along rows. The first input is at `at`.
+fn filter_column(at: u32) -> Filtered {
+    var sum: Filtered;
+    add(&sum, rows[at], T0);
+    add(&sum, rows[at + 16u], T1);
+    add(&sum, rows[at + 32u], T2);
+    add(&sum, rows[at + 48u], T3);
+    add(&sum, rows[at + 64u], T4);
+    add(&sum, rows[at + 80u], T5);
+    add(&sum, rows[at + 96u], T6);
+    add(&sum, rows[at + 112u], T7);
+    add(&sum, rows[at + 128u], T8);
+    add(&sum, rows[at + 144u], T9);
+    add(&sum, rows[at + 160u], T10);
+    add(&sum, rows[at + 176u], T11);
+    add(&sum, rows[at + 192u], T12);
+    add(&sum, rows[at + 208u], T13);
+    return sum;
+}
+
 // Pixels per row and per column of a plane that carries a border of RADIUS zeros and ends at whole tiles.
 fn bordered(size: u32) -> u32 {
     return (size + 15u) / 16u * 16u + 2u * RADIUS;

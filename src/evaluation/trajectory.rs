@@ -1,8 +1,8 @@
 //! Trajectory errors: association by time, alignment, absolute (ATE) and relative (RPE) error.
 //!
 //! Definitions: Sturm et al., *A benchmark for the evaluation of RGB-D SLAM systems*, 2012; Umeyama, *Least-squares estimation of
-//! transformation parameters between two point patterns*, 1991 (`geometry/alignment.rs`). The figures are those of the Python package `evo` (`evo_ape tum truth estimate -a`, `-as`,
-//! `--t_max_diff 0.02`); `tests/evo.rs` holds them together.
+//! transformation parameters between two point patterns*, 1991 (`geometry/alignment.rs`). The figures are those of the Python package
+//! `evo` (`evo_ape tum truth estimate -a`, `-as`, `--t_max_diff 0.02`); `tests/evo.rs` holds them together.
 //!
 //! Left out: interpolation of the truth between its stamps, and errors over path lengths (KITTI's).
 

@@ -108,7 +108,7 @@ fn hand_on(sender: &mut KeyframeSender<'_>, rectifier: &Rectifier, frame: &Frame
     }
     let Some(NewKeyframe { id, world_from_camera, seen, covisible }) = tracked.keyframe else { return true };
     let mut image = rectifier.rectify(frame);
-    if image.depth.is_none() {
+    if image.depth.is_none() && !seen.is_empty() {
         image.depth = Some(rectifier.sparse_depth(&seen));
     }
     let keyframe = Keyframe { id, world_from_camera, image, covisible: covisible.into_iter().map(|(id, _)| id).collect() };

@@ -1,9 +1,10 @@
-//! RGB-D tracking from ORB features, after the tracking and local mapping of ORB-SLAM2 (Mur-Artal & Tardós, *IEEE T-RO* 2017) in our
-//! own code: features and PnP are OpenCV's, everything else is here.
+//! Tracking from ORB features for RGB-D, stereo and one camera alone, after ORB-SLAM2 (Mur-Artal & Tardós, *IEEE T-RO* 2017) in our own
+//! code: features, PnP, and the fits behind a two-view start are OpenCV's, everything else is here.
 //!
-//! One frame: features with depth → the pose predicted from the last motion → last frame's points → the local map. Now and then a
-//! keyframe: landmarks from depth, joined with what its neighbours see → local bundle adjustment. All in the caller's thread, in one
-//! fixed order: the same frames give the same bits. Knows nothing of the mapper or the GPU.
+//! One frame: features, with depth where the sensor gives it → the pose predicted from the last motion → last frame's points → the local
+//! map; all pixels where features are too few (RGB-D). Now and then a keyframe: landmarks from depth and by triangulation, joined with
+//! what its neighbours see → local bundle adjustment → loop closing. All in the caller's thread, in one fixed order: the same frames give
+//! the same bits. Knows nothing of the mapper or the GPU.
 
 mod bundle;
 mod config;
