@@ -8,7 +8,7 @@
 @group(0) @binding(4) var<storage, read> target_depth: array<f32>;
 // [3 channels, bordered H, bordered W], zero on the border.
 @group(0) @binding(5) var<storage, read> partials: array<vec4<f32>>;
-// [2, H, W] plane 0 (r, g, b, Σ w z), plane 1 (alpha, -, -, -).
+// [2, H, W] plane 0 (r, g, b, Σ w z), plane 1 (alpha; mean |colour error|, for the scores; -, -).
 @group(0) @binding(6) var<storage, read_write> image_gradients: array<vec4<f32>>;
 
 // (by mean, by square, by product) of one channel filtered along rows: [26 rows, 16 columns].
@@ -57,7 +57,8 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
             gradient_alpha = -gradient[k].w * measured;
         }
         image_gradients[index] = gradient[k];
-        image_gradients[pixels + index] = vec4(gradient_alpha, 0.0, 0.0, 0.0);
+        let error = abs(rendered[k].xyz - wanted[k].xyz);
+        image_gradients[pixels + index] = vec4(gradient_alpha, (error.x + error.y + error.z) / 3.0, 0.0, 0.0);
     }
 }
 

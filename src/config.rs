@@ -104,6 +104,28 @@ impl Config {
         Ok(config)
     }
 
+    /// The same with single values changed, each written `key.of.value=value` as in TOML; a bare word counts as text. Checked.
+    pub fn with_settings<S: AsRef<str>>(&self, settings: &[S]) -> Result<Self, ConfigError> {
+        let mut table = toml::Table::try_from(self).expect("a configuration is plain data");
+        for setting in settings.iter().map(AsRef::as_ref) {
+            let wrong = |why: &str| ConfigError::Value(format!("`{setting}`: {why}"));
+            let (key, value) = setting.split_once('=').ok_or_else(|| wrong("write key=value, like mapping.seed=1"))?;
+            let value = toml::from_str::<toml::Table>(&format!("v = {value}")).ok().and_then(|mut t| t.remove("v"));
+            let value = value.unwrap_or_else(|| toml::Value::String(setting[key.len() + 1..].into()));
+            let mut parts: Vec<&str> = key.trim().split('.').collect();
+            let last = parts.pop().unwrap_or_default();
+            let mut inner = &mut table;
+            for part in parts {
+                inner = inner.get_mut(part).and_then(toml::Value::as_table_mut).ok_or_else(|| wrong("there is no such setting"))?;
+            }
+            inner.insert(last.into(), value);
+        }
+        let text = toml::to_string(&table).expect("a table is TOML");
+        let config: Self = toml::from_str(&text).map_err(|e| ConfigError::Value(e.message().to_string()))?;
+        config.validate()?;
+        Ok(config)
+    }
+
     /// Checks all values.
     pub fn validate(&self) -> Result<(), ConfigError> {
         let value = |message: String| Err(ConfigError::Value(message));
@@ -154,6 +176,15 @@ mod tests {
         assert!(wrong("map_scale = 2.0").contains("map_scale"));
         assert!(wrong("[mapping.seeding]\nstride = 0").contains("stride"));
         assert!(wrong("[mapping.adam]\nbeta_1 = 1.0").contains("beta_1"));
+    }
+
+    #[test]
+    fn single_values_are_set_by_their_keys() {
+        let config = Config::default().with_settings(&["mapping.seed=7", "adapter=llvmpipe", "mapping.loss.ssim_weight=0.3"]).unwrap();
+        assert_eq!((config.mapping.seed, config.adapter.as_deref(), config.mapping.loss.ssim_weight), (7, Some("llvmpipe"), 0.3));
+        let wrong = |text: &str| Config::default().with_settings(&[text]).unwrap_err().to_string();
+        assert!(wrong("mapping.seeed=7").contains("seeed") && wrong("maping.seed=7").contains("no such"));
+        assert!(wrong("map_scale=2.0").contains("map_scale") && wrong("mapping.seed").contains("key=value"));
     }
 
     #[test]

@@ -6,7 +6,7 @@
 // [H, W] rendered (r, g, b, Σ w z) and (transmittance, last).
 @group(0) @binding(5) var<storage, read> color_depth: array<vec4<f32>>;
 @group(0) @binding(6) var<storage, read> state: array<vec2<f32>>;
-// [2, H, W] gradients of the loss: plane 0 (r, g, b, Σ w z), plane 1 (alpha, -, -, -).
+// [2, H, W] gradients of the loss: plane 0 (r, g, b, Σ w z), plane 1 (alpha, |error|, -, -).
 @group(0) @binding(7) var<storage, read> image_gradients: array<vec4<f32>>;
 // [pairs, 3] see `PairGradient`.
 @group(0) @binding(8) var<storage, read_write> pair_gradients: array<vec4<f32>>;

@@ -1,5 +1,7 @@
 //! `keysplat bench`
 
+mod ablation;
+
 use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand, ValueEnum};
@@ -27,6 +29,8 @@ pub struct BenchArgs {
 enum What {
     /// One training step, on made-up scenes or on the map of a run, stage by stage, beside what the adapter could do at its best.
     Step(StepArgs),
+    /// Mappers with different settings on the same keyframes of a recording: time, Gaussians, held-out quality.
+    Ablation(ablation::AblationArgs),
 }
 
 #[derive(Args)]
@@ -97,6 +101,7 @@ struct Report {
 pub fn bench(args: &BenchArgs) -> miette::Result<()> {
     match &args.what {
         What::Step(args) => step(args),
+        What::Ablation(args) => ablation::ablation(args),
     }
 }
 

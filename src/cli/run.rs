@@ -21,7 +21,7 @@ pub struct RunArgs {
     sequence: Option<PathBuf>,
     /// Folder for the results.
     #[arg(short, long)]
-    out: PathBuf,
+    pub out: PathBuf,
     /// Configuration (TOML); options on the command line go before it.
     #[arg(short, long)]
     config: Option<PathBuf>,
@@ -49,6 +49,9 @@ pub struct RunArgs {
     /// Part of the name of the adapter to use (see `keysplat adapters`).
     #[arg(long)]
     adapter: Option<String>,
+    /// Set any value of the configuration, e.g. --set mapping.iterations_per_keyframe=20 (may be given again).
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
 }
 
 fn parse_range(text: &str) -> Result<(usize, usize), String> {
@@ -60,7 +63,7 @@ fn parse_range(text: &str) -> Result<(usize, usize), String> {
 }
 
 impl RunArgs {
-    fn resolve(&self) -> miette::Result<Config> {
+    pub fn resolve(&self) -> miette::Result<Config> {
         let mut config = self.config.as_deref().map_or_else(|| Ok(Config::default()), Config::read).into_diagnostic()?;
         if let Some(path) = &self.sequence {
             // Absolute, so that the written configuration finds it from anywhere.
@@ -79,8 +82,7 @@ impl RunArgs {
         config.replay.frames = self.frames.or(config.replay.frames);
         config.replay.paced |= self.paced;
         config.adapter = self.adapter.clone().or(config.adapter);
-        config.validate().into_diagnostic()?;
-        Ok(config)
+        config.with_settings(&self.set).into_diagnostic()
     }
 }
 

@@ -24,6 +24,12 @@ impl GpuBuffer {
         Self::create(gpu, label, bytes, usage, gpu.max_storage_bytes())
     }
 
+    /// Storage that other shaders read as a uniform: a few numbers that one pass computes for the next.
+    pub fn computed_uniform(gpu: &Gpu, label: &str, bytes: u64) -> Result<Self, GpuError> {
+        let usage = BufferUsages::STORAGE | BufferUsages::UNIFORM | BufferUsages::COPY_SRC | BufferUsages::COPY_DST;
+        Self::create(gpu, label, bytes, usage, gpu.device.limits().max_uniform_buffer_binding_size)
+    }
+
     /// A uniform that holds `value`.
     pub fn uniform<T: Pod>(gpu: &Gpu, label: &str, value: &T) -> Result<Self, GpuError> {
         let bytes = std::mem::size_of::<T>() as u64;

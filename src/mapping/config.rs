@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::DensityConfig;
 use crate::optimise::{AdamConfig, LossConfig};
 use crate::splat::ShDegree;
 
@@ -19,7 +20,7 @@ pub struct MappingConfig {
     pub seed: u64,
     pub window: WindowConfig,
     pub seeding: SeedingConfig,
-    pub prune: PruneConfig,
+    pub density: DensityConfig,
     pub loss: LossConfig,
     pub adam: AdamConfig,
 }
@@ -33,7 +34,7 @@ impl Default for MappingConfig {
             seed: 0,
             window: WindowConfig::default(),
             seeding: SeedingConfig::default(),
-            prune: PruneConfig::default(),
+            density: DensityConfig::default(),
             loss: LossConfig::default(),
             adam: AdamConfig::default(),
         }
@@ -73,6 +74,8 @@ pub struct SeedingConfig {
     pub depth_disagreement: f32,
     /// Standard deviation of a seed in units of its spacing on the surface.
     pub footprint: f32,
+    /// Standard deviation of a seed across its surface in units of that along it.
+    pub thickness: f32,
     /// Opacity of a seed.
     pub opacity: f32,
     /// No seed nearer to the camera or farther than this, metres.
@@ -89,26 +92,11 @@ impl Default for SeedingConfig {
             min_alpha: 0.6,
             depth_disagreement: 0.06,
             footprint: 0.55,
+            thickness: 1.0,
             opacity: 0.7,
             min_depth_metres: 0.15,
             max_depth_metres: 20.0,
         }
-    }
-}
-
-/// Which Gaussians are dropped after a keyframe's steps.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct PruneConfig {
-    /// Opacity below which a Gaussian is dropped.
-    pub min_opacity: f32,
-    /// Largest standard deviation, metres.
-    pub max_scale_metres: f32,
-}
-
-impl Default for PruneConfig {
-    fn default() -> Self {
-        Self { min_opacity: 0.03, max_scale_metres: 1.0 }
     }
 }
 
@@ -123,7 +111,6 @@ impl MappingConfig {
             ("window.older_share", self.window.older_share),
             ("seeding.min_alpha", s.min_alpha),
             ("seeding.opacity", s.opacity),
-            ("prune.min_opacity", self.prune.min_opacity),
         ];
         if let Some((name, value)) = shares.iter().find(|(_, value)| !(0.0..1.0).contains(value)) {
             return Err(format!("mapping.{name} must lie between 0 and 1, not {value}"));
@@ -131,10 +118,10 @@ impl MappingConfig {
         let positive = [
             ("seeding.depth_disagreement", s.depth_disagreement),
             ("seeding.footprint", s.footprint),
+            ("seeding.thickness", s.thickness),
             ("seeding.opacity", s.opacity),
             ("seeding.min_depth_metres", s.min_depth_metres),
             ("seeding.max_depth_metres", s.max_depth_metres),
-            ("prune.max_scale_metres", self.prune.max_scale_metres),
         ];
         if let Some((name, value)) = positive.iter().find(|(_, value)| !(value.is_finite() && *value > 0.0)) {
             return Err(format!("mapping.{name} must be positive, not {value}"));
@@ -142,6 +129,7 @@ impl MappingConfig {
         if self.window.recent == 0 {
             return Err("mapping.window.recent must be at least 1".into());
         }
+        self.density.validate().map_err(|e| format!("mapping.density: {e}"))?;
         self.loss.validate().map_err(|e| format!("mapping.loss: {e}"))?;
         self.adam.validate().map_err(|e| format!("mapping.adam: {e}"))
     }

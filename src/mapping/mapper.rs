@@ -5,13 +5,15 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use fastrand::Rng;
+use glam::{Quat, Vec3};
 
-use super::anchors::{self, Anchors};
+use super::density::{self, Candidate};
 use super::keyframe::MappedKeyframe;
-use super::{Keyframe, KeyframeId, MappingConfig, prune, seeding};
+use super::ledger::{self, Ledger};
+use super::{Keyframe, KeyframeId, MappingConfig, seeding};
 use crate::geometry::Se3;
 use crate::gpu::{Gpu, GpuError};
-use crate::optimise::{Optimiser, StepReport, TrainingView};
+use crate::optimise::{GaussianScore, Optimiser, StepReport, TrainingView, WrongPixels};
 use crate::render::{GpuCloud, Rasterizer, Rendered};
 use crate::splat::GaussianCloud;
 use crate::splat::ViewCamera;
@@ -36,6 +38,8 @@ pub struct KeyframeReport {
     pub id: KeyframeId,
     pub seeded: usize,
     pub pruned: usize,
+    /// Gaussians that came by dividing others.
+    pub grown: usize,
     pub gaussians: usize,
     pub iterations: usize,
     /// Mean PSNR of the steps' views before each step.
@@ -50,7 +54,7 @@ pub struct Mapper {
     rasterizer: Rasterizer,
     optimiser: Optimiser,
     cloud: GpuCloud,
-    anchors: Anchors,
+    ledger: Ledger,
     keyframes: Vec<MappedKeyframe>,
     rng: Rng,
     step_times: Vec<Duration>,
@@ -64,7 +68,7 @@ impl Mapper {
             optimiser: Optimiser::new(&rasterizer)?,
             rasterizer,
             cloud: GpuCloud::new(&gpu, config.sh_degree, FIRST_CAPACITY)?,
-            anchors: Anchors::default(),
+            ledger: Ledger::default(),
             keyframes: Vec::new(),
             rng: Rng::with_seed(config.seed),
             step_times: Vec::new(),
@@ -83,12 +87,8 @@ impl Mapper {
         let first = self.keyframes.len() == 1;
         let iterations = if first { self.config.first_iterations } else { self.config.iterations_per_keyframe };
         let (done, psnr_db) = self.optimise(iterations, stop)?;
-        let before = self.cloud.len();
-        let keep = prune::plan(&self.gpu, &self.cloud, &self.config.prune)?;
-        self.cloud.keep(&self.gpu, &keep)?;
-        self.anchors.keep(&keep);
-        let gaussians = self.cloud.len();
-        Ok(KeyframeReport { id: keyframe.id, seeded, pruned: before - gaussians, gaussians, iterations: done, psnr_db })
+        let (pruned, grown) = self.control_density()?;
+        Ok(KeyframeReport { id: keyframe.id, seeded, pruned, grown, gaussians: self.cloud.len(), iterations: done, psnr_db })
     }
 
     /// Moves earlier keyframes to better poses, and with those that move far the Gaussians seeded from them; returns how many. Unknown
@@ -99,11 +99,11 @@ impl Mapper {
         for keyframe in &mut self.keyframes {
             if let Some(world_from_camera) = updates.get(&keyframe.id) {
                 let old_world_from_camera = keyframe.camera.camera_from_world.inverse();
-                motions.extend(anchors::motion(&old_world_from_camera, world_from_camera).map(|motion| (keyframe.id, motion)));
+                motions.extend(ledger::motion(&old_world_from_camera, world_from_camera).map(|motion| (keyframe.id, motion)));
                 keyframe.camera.camera_from_world = world_from_camera.inverse();
             }
         }
-        let moved = self.anchors.moved(&motions);
+        let moved = self.ledger.moved(&motions);
         self.cloud.transform(&self.gpu, &moved)?;
         Ok(moved.iter().map(|(run, _)| run.len()).sum())
     }
@@ -131,8 +131,37 @@ impl Mapper {
         let rendered = if self.cloud.is_empty() { None } else { Some(self.render(camera)?) };
         let seeds = seeding::seed(keyframe, rendered.as_ref(), &self.config.seeding, self.config.sh_degree);
         let left_out = self.cloud.append(&self.gpu, &seeds)?;
-        self.anchors.append(keyframe.id, seeds.len() - left_out);
+        self.ledger.append(keyframe.id, seeds.len() - left_out);
         Ok(seeds.len())
+    }
+
+    /// Removes and divides Gaussians by the scores of the last steps; returns how many fewer and how many more there are for it.
+    fn control_density(&mut self) -> Result<(usize, usize), MappingError> {
+        if self.cloud.is_empty() {
+            return Ok((0, 0));
+        }
+        let scores = match self.config.density.scored() {
+            Some(_) => self.optimiser.read_scores(&self.gpu, &self.cloud)?,
+            None => vec![GaussianScore::default(); self.cloud.len()],
+        };
+        self.ledger.keyframe_mapped(&scores);
+        let [geometry, scales, rotations] = [0, 1, 2].map(|plane| self.cloud.read_plane(&self.gpu, plane));
+        let (geometry, scales, rotations) = (geometry?, scales?, rotations?);
+        let candidate = |i: usize| {
+            let ([x, y, z, raw_opacity], [a, b, c, _], [qw, qx, qy, qz]) = (geometry[i], scales[i], rotations[i]);
+            let (mean, log_scale, rotation) = (Vec3::new(x, y, z), Vec3::new(a, b, c), Quat::from_xyzw(qx, qy, qz, qw));
+            Candidate { mean, raw_opacity, log_scale, rotation, score: scores[i], entry: self.ledger.entries()[i] }
+        };
+        let candidates: Vec<Candidate> = (0..self.cloud.len()).map(candidate).collect();
+        let plan = density::plan(&candidates, &self.config.density);
+        let (before, children) = (self.cloud.len(), plan.children.len());
+        let geometry = |c: &density::Child| [c.mean.extend(c.raw_opacity).into(), c.log_scale.extend(0.0).into()];
+        let parents: Vec<u32> = plan.children.iter().map(|c| c.parent).collect();
+        let geometry: Vec<[[f32; 4]; 2]> = plan.children.iter().map(geometry).collect();
+        self.cloud.change(&self.gpu, &plan.keep, (&parents, &geometry))?;
+        self.ledger.apply(&plan.keep, parents.into_iter());
+        // Two children take their parent's place.
+        Ok((before - plan.keep.len() - children / 2, children / 2))
     }
 
     fn optimise(&mut self, iterations: usize, stop: &dyn Fn() -> bool) -> Result<(usize, f32), MappingError> {
@@ -141,10 +170,7 @@ impl Mapper {
         let mut done = 0;
         while done < iterations && !stop() && !self.cloud.is_empty() {
             let batch: Vec<usize> = (done..iterations.min(done + BATCH)).map(|step| self.draw(&window, step)).collect();
-            let started = Instant::now();
-            let reports = self.steps(&batch)?;
-            let share = started.elapsed() / batch.len() as u32;
-            self.step_times.extend(std::iter::repeat_n(share, batch.len()));
+            let reports = self.steps(&batch, None)?;
             for (report, &index) in reports.iter().zip(&batch) {
                 if !report.loss.total(&self.config.loss).is_finite() {
                     return Err(MappingError::NotFinite { id: self.keyframes[index].id });
@@ -153,13 +179,29 @@ impl Mapper {
             }
             done += batch.len();
         }
+        done += self.score(&window)?;
         Ok((done, psnr_sum / done.max(1) as f32))
     }
 
-    fn steps(&mut self, batch: &[usize]) -> Result<Vec<StepReport>, GpuError> {
-        let view = |&index: &usize| TrainingView { camera: self.keyframes[index].camera, target: &self.keyframes[index].target };
+    /// A last step of each of some keyframes of the window, evenly spread over it, that scores the Gaussians; returns their number.
+    fn score(&mut self, window: &[usize]) -> Result<usize, MappingError> {
+        let Some(wrong) = self.config.density.scored() else { return Ok(0) };
+        self.optimiser.begin_scores(&self.gpu, &self.cloud)?;
+        let views = self.config.density.views.min(window.len());
+        let chosen: Vec<usize> = (0..views).map(|k| window[k * window.len() / views]).collect();
+        Ok(self.steps(&chosen, Some(wrong))?.len())
+    }
+
+    fn steps(&mut self, batch: &[usize], scored: Option<WrongPixels>) -> Result<Vec<StepReport>, GpuError> {
+        let view = |&index: &usize| {
+            let MappedKeyframe { camera, target, .. } = &self.keyframes[index];
+            TrainingView { camera: *camera, target, scored }
+        };
         let views: Vec<TrainingView<'_>> = batch.iter().map(view).collect();
-        self.optimiser.steps(&mut self.rasterizer, &self.cloud, &views, (&self.config.loss, &self.config.adam))
+        let started = Instant::now();
+        let reports = self.optimiser.steps(&mut self.rasterizer, &self.cloud, &views, (&self.config.loss, &self.config.adam))?;
+        self.step_times.extend(std::iter::repeat_n(started.elapsed() / batch.len().max(1) as u32, batch.len()));
+        Ok(reports)
     }
 
     /// Indices of the newest keyframes and of the older ones that share most landmarks with the newest.

@@ -1,13 +1,14 @@
 //! The mapping thread's work: keyframes in, Gaussians seeded, optimised over a sliding window and pruned, snapshots out.
 //! Knows nothing of tracking; poses and covisibility arrive with the keyframes.
 
-mod anchors;
 mod config;
+mod density;
 mod keyframe;
+mod ledger;
 mod mapper;
-mod prune;
 mod seeding;
 
-pub use config::{MappingConfig, PruneConfig, SeedingConfig, WindowConfig};
+pub use config::{MappingConfig, SeedingConfig, WindowConfig};
+pub use density::{ClassicConfig, DensityConfig, DensityStrategy, VcdConfig};
 pub use keyframe::{Keyframe, KeyframeId};
 pub use mapper::{KeyframeReport, Mapper, MappingError};

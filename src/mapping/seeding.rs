@@ -5,7 +5,7 @@
 //! where the sides differ (a structured-light sensor is blind in the shadow beside a near object). Later views correct them.
 
 use glam::{Quat, Vec3};
-use nalgebra::{Point3, Vector2};
+use nalgebra::{Point3, Rotation3, UnitQuaternion, Vector2, Vector3};
 
 use super::{Keyframe, SeedingConfig};
 use crate::render::Rendered;
@@ -14,6 +14,9 @@ use crate::splat::{Gaussian, GaussianCloud, ShDegree, raw_opacity_from_opacity, 
 
 /// Sides of a hole whose depths differ by more than this factor belong to different surfaces.
 const SAME_SURFACE_RATIO: f32 = 1.2;
+
+/// Discs seen more obliquely than this are drawn no longer.
+const MIN_COSINE: f64 = 0.35;
 
 /// Seeds for what `keyframe` shows and `rendered`, the map seen from it, does not. Without a render the whole image is seeded.
 pub(super) fn seed(
@@ -41,7 +44,8 @@ pub(super) fn seed(
                         && metres <= config.max_depth_metres
                         && rendered.is_none_or(|r| lacks(r, (center.1 * width + center.0) as usize, measured, config))
                     {
-                        cloud.push(gaussian(keyframe, center, metres, stride, config));
+                        let slope = slope(&filled, (width, height), center, stride);
+                        cloud.push(gaussian(keyframe, center, (metres, slope), stride, config));
                     }
                 }
             }
@@ -56,16 +60,46 @@ fn lacks(rendered: &Rendered, pixel: usize, measured: Option<f32>, config: &Seed
     rendered.alpha(pixel) < config.min_alpha || measured.is_some_and(nearer)
 }
 
-fn gaussian(keyframe: &Keyframe, (x, y): (u32, u32), metres: f32, stride: u32, config: &SeedingConfig) -> Gaussian {
+/// ∂depth/∂(x, y) around a pixel relative to the depth, 1/pixels; none across an edge.
+fn slope(filled: &[f32], (width, height): (u32, u32), (x, y): (u32, u32), stride: u32) -> [f32; 2] {
+    let at = |x: u32, y: u32| filled[(y * width + x) as usize];
+    let along = |low: f32, here: f32, high: f32, span: u32| {
+        let smooth = low > 0.0 && high > 0.0 && low.max(here).max(high) < SAME_SURFACE_RATIO * low.min(here).min(high);
+        if smooth && span > 0 { (high - low) / (here * span as f32) } else { 0.0 }
+    };
+    let reach = stride.max(2);
+    let (left, right) = (x.saturating_sub(reach), (x + reach).min(width - 1));
+    let (top, bottom) = (y.saturating_sub(reach), (y + reach).min(height - 1));
+    [along(at(left, y), at(x, y), at(right, y), right - left), along(at(x, top), at(x, y), at(x, bottom), bottom - top)]
+}
+
+/// A disc on the surface, as large as its block of pixels there.
+fn gaussian(keyframe: &Keyframe, (x, y): (u32, u32), (metres, slope): (f32, [f32; 2]), stride: u32, config: &SeedingConfig) -> Gaussian {
     let pinhole = &keyframe.image.pinhole;
-    let p_in_camera = pinhole.unproject(&Vector2::new(f64::from(x), f64::from(y)), f64::from(metres));
-    let p_in_world = keyframe.world_from_camera * Point3::from(p_in_camera);
+    let ray = pinhole.unproject(&Vector2::new(f64::from(x), f64::from(y)), 1.0);
+    let p_in_world = keyframe.world_from_camera * Point3::from(ray * f64::from(metres));
     let spacing_metres = stride as f32 * metres / pinhole.fx as f32;
     let color = keyframe.image.color.get_pixel(x, y).0.map(|c| f32::from(c) / 255.0);
+    // The surface's tangents along x and y of the image, per pixel at depth 1: ∂(z·ray)/∂x.
+    let tangent = |k: usize, focal: f64| {
+        let mut along = Vector3::zeros();
+        along[k] = 1.0 / focal;
+        along + ray * f64::from(slope[k])
+    };
+    let normal = tangent(0, pinhole.fx).cross(&tangent(1, pinhole.fy)).normalize();
+    let cosine = (normal.dot(&ray) / ray.norm()).abs().max(MIN_COSINE);
+    // The tilt's direction, in which the block is longer on the surface; any direction across where there is no tilt.
+    let across = normal.cross(&ray).try_normalize(1e-6).unwrap_or_else(|| normal.cross(&Vector3::y()).normalize());
+    let tilt = normal.cross(&across);
+    let axes = Rotation3::from_basis_unchecked(&[across, tilt, normal]);
+    let world_from_disc = (keyframe.world_from_camera.rotation * UnitQuaternion::from_rotation_matrix(&axes)).coords.map(|v| v as f32);
+    let [qx, qy, qz, qw] = world_from_disc.into();
+    let size = config.footprint * spacing_metres;
+    let scale = Vec3::new(size, size / cosine as f32, size * config.thickness);
     Gaussian {
         mean: Vec3::new(p_in_world.x as f32, p_in_world.y as f32, p_in_world.z as f32),
-        log_scale: Vec3::splat((config.footprint * spacing_metres).ln()),
-        rotation: Quat::IDENTITY,
+        log_scale: Vec3::new(scale.x.ln(), scale.y.ln(), scale.z.ln()),
+        rotation: Quat::from_xyzw(qx, qy, qz, qw),
         raw_opacity: raw_opacity_from_opacity(config.opacity),
         sh: vec![dc_from_color(Vec3::from(color))],
     }

@@ -3,7 +3,9 @@
 mod adam;
 mod loss;
 mod optimiser;
+mod scores;
 
 pub use adam::AdamConfig;
 pub use loss::{LossConfig, LossTerms, TargetImage};
 pub use optimiser::{Gradients, Optimiser, StepReport, TrainingView};
+pub use scores::{GaussianScore, WrongPixels};

@@ -4,6 +4,7 @@ use std::time::{Duration, Instant};
 
 use bytemuck::{Pod, Zeroable};
 
+use super::scores::{GaussianScore, Scores, WrongPixels};
 use super::{AdamConfig, LossConfig, LossTerms, TargetImage};
 use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, workgroups};
 use crate::render::layout::{AdamSetup, COUNTERS, Counter, LossSetup, VISIBLE_COUNTER, View};
@@ -30,6 +31,8 @@ pub struct StepReport {
 pub struct TrainingView<'a> {
     pub camera: ViewCamera,
     pub target: &'a TargetImage,
+    /// Whether the step also scores the Gaussians (see [`Optimiser::begin_scores`]).
+    pub scored: Option<WrongPixels>,
 }
 
 /// What a step leaves behind on the GPU: sums of the loss, and the counters.
@@ -52,7 +55,8 @@ pub struct Gradients {
 
 /// Where the backward pass starts from.
 enum Objective<'a> {
-    Image(&'a TargetImage, &'a LossConfig),
+    /// With the Gaussians' scores on the way, if asked for.
+    Image(&'a TargetImage, &'a LossConfig, Option<&'a WrongPixels>),
     /// Gradients by the image are in the buffer already.
     Given,
 }
@@ -78,6 +82,7 @@ struct Kernels {
 #[derive(Debug)]
 pub struct Optimiser {
     kernels: Kernels,
+    scores: Scores,
     /// Steps submitted so far, and the host's time to encode and submit them.
     steps: usize,
     encode_time: Duration,
@@ -118,6 +123,7 @@ impl Optimiser {
         let empty = |label: &str| GpuBuffer::storage(gpu, label, 16);
         Ok(Self {
             kernels,
+            scores: Scores::new(rasterizer)?,
             steps: 0,
             encode_time: Duration::ZERO,
             adam: GpuBuffer::uniform(gpu, "Adam", &AdamSetup::zeroed())?,
@@ -127,7 +133,7 @@ impl Optimiser {
             partials: empty("loss partials")?,
             image_gradients: empty("image gradients")?,
             loss_sums: empty("loss sums")?,
-            loss_total: empty("loss")?,
+            loss_total: GpuBuffer::computed_uniform(gpu, "loss", 16)?,
             pose_sums: empty("pose sums")?,
             pose_gradient: GpuBuffer::storage(gpu, "pose gradient", 32)?,
         })
@@ -149,12 +155,13 @@ impl Optimiser {
         let mut pending: Vec<usize> = (0..views.len()).collect();
         while !pending.is_empty() {
             for (entry, &i) in pending.iter().enumerate() {
-                let TrainingView { camera, target } = &views[i];
+                let TrainingView { camera, target, scored } = &views[i];
+                let objective = Objective::Image(target, loss, scored.as_ref());
                 let started = Instant::now();
                 self.adam.write(&gpu, 0, &[adam.setup(self.steps)]);
                 self.steps += 1;
                 let mut encoder = gpu.device.create_command_encoder(&Default::default());
-                self.encode(&mut encoder, rasterizer, cloud, (camera, [0.0; 3]), &Objective::Image(target, loss), &Sink::Adam)?;
+                self.encode(&mut encoder, rasterizer, cloud, (camera, [0.0; 3]), &objective, &Sink::Adam)?;
                 self.encode_log(&mut encoder, rasterizer, &log, entry);
                 let commands = encoder.finish();
                 self.encode_time += started.elapsed();
@@ -177,6 +184,16 @@ impl Optimiser {
             pending = repeat;
         }
         Ok(reports)
+    }
+
+    /// Forgets all scores: from here on, steps of scored views add to those of `cloud`, which must not grow or shrink meanwhile.
+    pub fn begin_scores(&mut self, gpu: &Gpu, cloud: &GpuCloud) -> Result<(), GpuError> {
+        self.scores.clear(gpu, cloud)
+    }
+
+    /// The scores since [`Self::begin_scores`], `[N]` in map order.
+    pub fn read_scores(&self, gpu: &Gpu, cloud: &GpuCloud) -> Result<Vec<GaussianScore>, GpuError> {
+        self.scores.read(gpu, cloud)
     }
 
     /// The host's time to encode and submit all steps so far.
@@ -202,7 +219,7 @@ impl Optimiser {
         loss: &LossConfig,
     ) -> Result<Gradients, GpuError> {
         let gpu = rasterizer.gpu().clone();
-        let mut gradients = self.collect(rasterizer, cloud, camera, [0.0; 3], &Objective::Image(target, loss))?;
+        let mut gradients = self.collect(rasterizer, cloud, camera, [0.0; 3], &Objective::Image(target, loss, None))?;
         gradients.loss = self.read_loss(&gpu, target)?;
         Ok(gradients)
     }
@@ -282,8 +299,10 @@ impl Optimiser {
         }
         let mut pass = encoder.begin_compute_pass(&Default::default());
         rasterizer.encode_forward(&mut pass, cloud, &prepared);
-        if let Objective::Image(target, loss) = objective {
+        if let Objective::Image(target, loss, scored) = objective {
             self.encode_loss(&mut pass, rasterizer, target, loss);
+            let image = (&self.image_gradients, &self.loss_total);
+            scored.iter().for_each(|wrong| self.scores.encode(&mut pass, rasterizer, &prepared, image, (wrong, loss)));
         }
         self.encode_backward(&mut pass, rasterizer, cloud, &prepared, sink);
         gpu.mark(&mut pass, Self::END_MARK);

@@ -37,7 +37,7 @@ pub enum PipelineError {
 }
 
 /// Tracker → mapper. The end of the sequence is the channel's end.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub enum MapperMessage {
     Keyframe(Box<Keyframe>),
     /// Earlier keyframes that bundle adjustment moved.

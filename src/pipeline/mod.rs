@@ -12,8 +12,10 @@ mod map_thread;
 mod messages;
 pub mod outputs;
 mod read_thread;
+mod recording;
 mod run;
 mod track_thread;
 
 pub use messages::{MapperMessage, PipelineError, Progress};
+pub use recording::{Mapped, Recording, record};
 pub use run::{Outcome, check_first_depth, check_size, run};

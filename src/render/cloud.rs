@@ -70,13 +70,10 @@ impl GpuCloud {
     pub fn append(&mut self, gpu: &Gpu, cloud: &GaussianCloud) -> Result<usize, GpuError> {
         assert_eq!(cloud.sh_degree, self.sh_degree, "a map has one spherical-harmonics degree");
         let finite: Vec<usize> = (0..cloud.len()).filter(|&i| is_finite(cloud, i)).collect();
-        if self.count + finite.len() > self.capacity {
-            // Twice the room, or what the adapter can bind; if that is too little, the allocation says how much is needed.
-            let needed = self.count + finite.len();
-            let most = gpu.max_storage_bytes() as usize / (self.planes() * 16);
-            let grown = needed.next_power_of_two().min(most).max(needed);
+        let capacity = self.capacity_for(gpu, self.count + finite.len());
+        if capacity > self.capacity {
             let all: Vec<u32> = (0..self.count as u32).collect();
-            self.rebuild(gpu, &all, grown)?;
+            self.rebuild(gpu, &all, capacity)?;
         }
         let zeros = vec![[0.0f32; 4]; finite.len()];
         for plane in 0..self.planes() {
@@ -90,9 +87,29 @@ impl GpuCloud {
         Ok(cloud.len() - finite.len())
     }
 
-    /// Keeps the Gaussians at `chosen` (ascending indices), parameters and moments together.
-    pub fn keep(&mut self, gpu: &Gpu, chosen: &[u32]) -> Result<(), GpuError> {
-        if chosen.len() == self.count { Ok(()) } else { self.rebuild(gpu, chosen, self.capacity) }
+    /// Keeps the Gaussians at `keep` (ascending indices) and appends a copy of each of `parents` with its own position, raw opacity and log
+    /// scale (planes 0 and 1). All keep their moments: a child goes on at its parent's pace.
+    pub fn change(&mut self, gpu: &Gpu, keep: &[u32], (parents, geometry): (&[u32], &[[[f32; 4]; 2]])) -> Result<(), GpuError> {
+        if keep.len() == self.count && parents.is_empty() {
+            return Ok(());
+        }
+        let sources: Vec<u32> = keep.iter().chain(parents).copied().collect();
+        self.rebuild(gpu, &sources, self.capacity_for(gpu, sources.len()))?;
+        for plane in 0..2 {
+            let values: Vec<[f32; 4]> = geometry.iter().map(|g| g[plane]).collect();
+            self.parameters.write(gpu, plane * self.capacity + keep.len(), &values);
+        }
+        Ok(())
+    }
+
+    /// Room for `needed` Gaussians: the present one, or twice as much as that or what the adapter can bind; if that is too little, the
+    /// allocation says how much is needed.
+    fn capacity_for(&self, gpu: &Gpu, needed: usize) -> usize {
+        if needed <= self.capacity {
+            return self.capacity;
+        }
+        let most = gpu.max_storage_bytes() as usize / (self.planes() * 16);
+        needed.next_power_of_two().min(most).max(needed)
     }
 
     /// Moves runs of Gaussians rigidly (new_from_old, in the world) and forgets their moments, which belong to where they were. On the

@@ -200,6 +200,13 @@ host_twins! {
         ssim_weight: f32,
         depth_weight: f32,
     }
+    /// What counts as a wrong pixel (`shaders/rasterize_scores.wgsl`).
+    ScoreSetup {
+        error_ratio: f32,
+        noise: f32,
+        ssim_weight: f32,
+        pixels: f32,
+    }
     /// Step sizes by plane and lane, and decay rates (`shaders/shared/sink_adam.wgsl`).
     AdamSetup {
         rates: [[f32; 4]; 5],

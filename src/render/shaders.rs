@@ -52,6 +52,8 @@ shaders! {
     LOSS_REDUCE = "loss_reduce", "loss_reduce", [], ["main"];
     RASTERIZE_BACKWARD_PIXELS = "rasterize_backward", "rasterize_backward_pixels", [VIEW, TILE, TILE_BACKWARD], ["main"];
     RASTERIZE_BACKWARD_SPLATS = "rasterize_backward", "rasterize_backward_splats", [VIEW, TILE, TILE_BACKWARD], ["main"];
+    RASTERIZE_SCORES = "rasterize_scores", "rasterize_scores", [VIEW, TILE, TILE_BACKWARD], ["main"];
+    GATHER_SCORES = "gather_scores", "gather_scores", [VIEW, COUNTERS], ["main"];
     PROJECT_BACKWARD = "project_backward", "project_backward", [VIEW, COUNTERS, PROJECTION, HARMONICS, SINK_GRADIENT], ["main"];
     PROJECT_BACKWARD_ADAM = "project_backward_adam", "project_backward", [VIEW, COUNTERS, PROJECTION, HARMONICS, SINK_ADAM], ["main"];
     POSE_REDUCE = "pose_reduce", "pose_reduce", [COUNTERS], ["main"];

@@ -1,0 +1,110 @@
+//! `keysplat bench ablation`
+
+use std::collections::BTreeSet;
+use std::sync::Arc;
+
+use clap::Args;
+use keysplat::config::Config;
+use keysplat::evaluation::metrics::ImageFigures;
+use keysplat::evaluation::views::{ViewSelection, evaluate_views};
+use keysplat::gpu::Gpu;
+use keysplat::pipeline::{self, Progress, Recording};
+use keysplat::sequence::Sequence;
+use keysplat::splat::GaussianCloud;
+use miette::IntoDiagnostic;
+use serde::Serialize;
+
+use super::super::run::{self, RunArgs};
+
+#[derive(Args)]
+pub(super) struct AblationArgs {
+    #[command(flatten)]
+    run: RunArgs,
+    /// A variant: its name and the settings in which it differs, e.g. "no pruning: mapping.prune.min_opacity=0" (may be given again).
+    #[arg(long = "variant", value_name = "NAME: KEY=VALUE …", value_parser = parse_variant)]
+    variants: Vec<Variant>,
+    /// Steps after each keyframe: every variant is run with each of these numbers, which gives it a curve.
+    #[arg(long, value_delimiter = ',')]
+    iterations: Vec<usize>,
+}
+
+/// Settings that differ from the base.
+#[derive(Clone, Debug, Serialize)]
+struct Variant {
+    name: String,
+    settings: Vec<String>,
+}
+
+fn parse_variant(text: &str) -> Result<Variant, String> {
+    let (name, settings) = text.split_once(':').ok_or("write NAME: KEY=VALUE KEY=VALUE")?;
+    Ok(Variant { name: name.trim().into(), settings: settings.split_whitespace().map(Into::into).collect() })
+}
+
+/// One row of the table.
+#[derive(Debug, Serialize)]
+struct Row {
+    variant: String,
+    iterations_per_keyframe: usize,
+    mapping_s: f64,
+    steps: usize,
+    gaussians: usize,
+    held_out: Option<ImageFigures>,
+}
+
+pub(super) fn ablation(args: &AblationArgs) -> miette::Result<()> {
+    let mut base = args.run.resolve()?;
+    let sequence = run::open(&mut base)?;
+    let gpu = Gpu::open(base.adapter.as_deref()).into_diagnostic()?;
+    let recording = pipeline::record(&sequence, &base, &Progress::default()).into_diagnostic()?;
+    println!("| variant | steps/keyframe | mapping s | steps | Gaussians | held-out PSNR dB | SSIM | depth L1 cm |");
+    println!("|---|---|---|---|---|---|---|---|");
+    let mut rows = Vec::new();
+    let given = Variant { name: "as given".into(), settings: Vec::new() };
+    let variants = if args.variants.is_empty() { std::slice::from_ref(&given) } else { &args.variants };
+    for variant in variants {
+        let config = base.with_settings(&variant.settings).into_diagnostic()?;
+        let own = [config.mapping.iterations_per_keyframe];
+        for &iterations in if args.iterations.is_empty() { &own } else { args.iterations.as_slice() } {
+            let mut config = config.clone();
+            config.mapping.iterations_per_keyframe = iterations;
+            let mapped = recording.map(&gpu, &config.mapping, &Progress::default()).into_diagnostic()?;
+            let row = Row {
+                variant: variant.name.clone(),
+                iterations_per_keyframe: iterations,
+                mapping_s: mapped.wall_s,
+                steps: mapped.steps,
+                gaussians: mapped.cloud.len(),
+                held_out: held_out((&sequence, &config), &gpu, &recording, &mapped.cloud)?,
+            };
+            print(&row);
+            rows.push(row);
+        }
+    }
+    let text = serde_json::to_string_pretty(&rows).into_diagnostic()?;
+    keysplat::export::write_atomically(&args.run.out.join("ablation.json"), text.as_bytes()).into_diagnostic()?;
+    Ok(())
+}
+
+/// The held-out views of a map.
+fn held_out(
+    (sequence, config): (&Sequence, &Config),
+    gpu: &Arc<Gpu>,
+    recording: &Recording,
+    cloud: &GaussianCloud,
+) -> miette::Result<Option<ImageFigures>> {
+    let is_held_out = |index: usize| config.replay.is_held_out(index);
+    let poses: Vec<_> = recording.poses.iter().filter(|(index, _)| is_held_out(*index)).copied().collect();
+    let selection = ViewSelection { poses: &poses, keyframes: &BTreeSet::new(), is_held_out: &is_held_out };
+    let images = evaluate_views((sequence, config.map_scale), (gpu, cloud), &selection, &mut |_| (), &|_| ()).into_diagnostic()?;
+    Ok(images.held_out)
+}
+
+fn print(row: &Row) {
+    let figures = row.held_out.as_ref().map_or_else(String::new, |f| {
+        let depth = f.depth_l1_m.map_or_else(String::new, |d| format!("{:.2}", d * 100.0));
+        let (psnr, ssim) = (f.psnr_db.unwrap_or_default(), f.ssim.unwrap_or_default());
+        format!("{psnr:.2} | {ssim:.4} | {depth}")
+    });
+    let Row { variant, iterations_per_keyframe, mapping_s, steps, gaussians, .. } = row;
+    println!("| {variant} | {iterations_per_keyframe} | {mapping_s:.1} | {steps} | {gaussians} | {figures} |");
+}

@@ -1,0 +1,131 @@
+//! What density control can be told.
+
+use serde::{Deserialize, Serialize};
+
+use crate::optimise::WrongPixels;
+
+/// How the map's density is controlled after each keyframe.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum DensityStrategy {
+    /// Multi-view-consistent densification and pruning (FastGS, arXiv 2511.04283), over the keyframe window.
+    #[default]
+    Vcd,
+    /// By the gradient alone (3DGS, Kerbl et al. 2023).
+    Classic,
+    /// Seeds only.
+    None,
+}
+
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct DensityConfig {
+    pub strategy: DensityStrategy,
+    /// Keyframes of the window that score the Gaussians.
+    pub views: usize,
+    /// Opacity below which a Gaussian is dropped.
+    pub min_opacity: f32,
+    /// Largest standard deviation, metres.
+    pub max_scale_metres: f32,
+    pub vcd: VcdConfig,
+    pub classic: ClassicConfig,
+}
+
+/// Thresholds of multi-view-consistent density control.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct VcdConfig {
+    /// A pixel is wrong where its error exceeds the view's mean error this many times,
+    pub error_ratio: f32,
+    /// and this much: mean absolute colour error, 0 to 1.
+    pub noise: f32,
+    /// A Gaussian is divided if it has more wrong pixels than this in the mean of the views
+    pub wrong_pixels: f32,
+    /// its mean absolute gradient (normalised device coordinates) exceeds this,
+    pub absolute_gradient: f32,
+    /// and its standard deviation this many pixels of the nearest view: finer detail than that no view shows.
+    pub split_pixels: f32,
+    /// At most this share of the scored Gaussians is divided at once, those with most wrong pixels first.
+    pub max_growth: f32,
+    /// Keyframes that a Gaussian is left in peace after it came.
+    pub min_age: u32,
+    /// A Gaussian that never adds more than this to a pixel is removed.
+    pub min_weight: f32,
+    /// Of the Gaussians below this opacity, the half with more wrong pixels is removed.
+    pub faint_opacity: f32,
+}
+
+/// Thresholds of 3DGS' density control.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ClassicConfig {
+    /// Mean gradient (normalised device coordinates) above which a Gaussian is divided.
+    pub gradient: f32,
+    /// Standard deviation from which on it is split rather than cloned, pixels of the nearest view.
+    pub split_pixels: f32,
+}
+
+impl Default for DensityConfig {
+    fn default() -> Self {
+        Self {
+            strategy: DensityStrategy::default(),
+            views: 4,
+            min_opacity: 0.03,
+            max_scale_metres: 1.0,
+            vcd: VcdConfig::default(),
+            classic: ClassicConfig::default(),
+        }
+    }
+}
+
+impl Default for VcdConfig {
+    fn default() -> Self {
+        Self {
+            error_ratio: 1.5,
+            noise: 0.02,
+            wrong_pixels: 5.0,
+            absolute_gradient: 1.2e-3,
+            split_pixels: 1.5,
+            max_growth: 0.1,
+            min_age: 2,
+            min_weight: 0.02,
+            faint_opacity: 0.1,
+        }
+    }
+}
+
+impl Default for ClassicConfig {
+    fn default() -> Self {
+        Self { gradient: 2e-4, split_pixels: 1.5 }
+    }
+}
+
+impl DensityConfig {
+    /// Whether, and by what, steps must score the Gaussians.
+    pub fn scored(&self) -> Option<WrongPixels> {
+        let VcdConfig { error_ratio, noise, .. } = self.vcd;
+        (self.strategy != DensityStrategy::None).then_some(WrongPixels { error_ratio, noise })
+    }
+
+    /// Says what is wrong with the values, if anything.
+    pub fn validate(&self) -> Result<(), String> {
+        if self.views == 0 {
+            return Err("views must be at least 1".into());
+        }
+        let (v, c) = (&self.vcd, &self.classic);
+        let shares =
+            [("min_opacity", self.min_opacity), ("vcd.min_weight", v.min_weight), ("vcd.faint_opacity", v.faint_opacity), ("vcd.noise", v.noise)];
+        if let Some((name, value)) = shares.iter().find(|(_, value)| !(0.0..1.0).contains(value)) {
+            return Err(format!("{name} must lie between 0 and 1, not {value}"));
+        }
+        let positive = [("max_scale_metres", self.max_scale_metres), ("vcd.split_pixels", v.split_pixels), ("classic.split_pixels", c.split_pixels)];
+        if let Some((name, value)) = positive.iter().find(|(_, value)| !(value.is_finite() && *value > 0.0)) {
+            return Err(format!("{name} must be positive, not {value}"));
+        }
+        let thresholds = [v.error_ratio, v.wrong_pixels, v.absolute_gradient, v.max_growth, c.gradient];
+        if thresholds.iter().any(|t| !(t.is_finite() && *t >= 0.0)) {
+            return Err("thresholds must be finite and not negative".into());
+        }
+        Ok(())
+    }
+}

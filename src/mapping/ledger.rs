@@ -1,0 +1,107 @@
+//! What the mapper remembers of each Gaussian: the keyframe that it was seeded from (when a closed loop moves a keyframe, its Gaussians
+//! go with it), its age, and what it was ever worth.
+
+use std::collections::BTreeMap;
+use std::ops::Range;
+
+use super::KeyframeId;
+use crate::geometry::Se3;
+use crate::optimise::GaussianScore;
+
+/// A keyframe that moves by less than both was only refined, and optimisation takes its Gaussians along; a loop moves it further.
+const MIN_SHIFT_METRES: f64 = 0.01;
+const MIN_TURN_RAD: f64 = 0.5 * std::f64::consts::PI / 180.0;
+
+/// Of one Gaussian.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(super) struct Entry {
+    /// It moves with this keyframe.
+    pub anchor: KeyframeId,
+    /// Keyframes that have been mapped since it came.
+    pub age: u32,
+    /// Scored views that blended it, ever.
+    pub views: u32,
+    /// The most that it added to a pixel of these, 0 to 1.
+    pub best_weight: f32,
+}
+
+/// The entries, `[N]` in map order. Seeds are appended and pruning keeps the order, so most of a keyframe's Gaussians lie side by side.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Ledger {
+    entries: Vec<Entry>,
+}
+
+impl Ledger {
+    /// The newest `count` Gaussians are of `keyframe`.
+    pub fn append(&mut self, keyframe: KeyframeId, count: usize) {
+        self.entries.extend(std::iter::repeat_n(Entry { anchor: keyframe, ..Entry::default() }, count));
+    }
+
+    /// Only the Gaussians at `keep` are left, and those of `parents` each have a child at the end.
+    pub fn apply(&mut self, keep: &[u32], parents: impl Iterator<Item = u32>) {
+        let child = |parent: u32| Entry { anchor: self.entries[parent as usize].anchor, ..Entry::default() };
+        let kept = keep.iter().map(|i| self.entries[*i as usize]);
+        self.entries = kept.chain(parents.map(child)).collect();
+    }
+
+    /// Another keyframe was mapped; `scores` are those of its scored views, if there were any.
+    pub fn keyframe_mapped(&mut self, scores: &[GaussianScore]) {
+        self.entries.iter_mut().for_each(|entry| entry.age += 1);
+        for (entry, score) in self.entries.iter_mut().zip(scores) {
+            entry.views += score.views as u32;
+            entry.best_weight = entry.best_weight.max(score.weight_max);
+        }
+    }
+
+    pub fn entries(&self) -> &[Entry] {
+        &self.entries
+    }
+
+    /// The runs of Gaussians whose keyframe is among `motions`, and each run's motion.
+    pub fn moved(&self, motions: &BTreeMap<KeyframeId, Se3>) -> Vec<(Range<usize>, Se3)> {
+        let mut runs = Vec::new();
+        let mut first = 0;
+        for run in self.entries.chunk_by(|a, b| a.anchor == b.anchor) {
+            if let Some(motion) = motions.get(&run[0].anchor) {
+                runs.push((first..first + run.len(), *motion));
+            }
+            first += run.len();
+        }
+        runs
+    }
+}
+
+/// new_from_old, how a world moves that is held by a camera; `None` if that is no more than a refinement.
+pub(super) fn motion(old_world_from_camera: &Se3, new_world_from_camera: &Se3) -> Option<Se3> {
+    let old_from_new = old_world_from_camera.inverse() * new_world_from_camera;
+    let far = old_from_new.translation.vector.norm() > MIN_SHIFT_METRES || old_from_new.rotation.angle() > MIN_TURN_RAD;
+    far.then(|| new_world_from_camera * old_world_from_camera.inverse())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::{Point3, Vector3};
+
+    #[test]
+    fn runs_follow_appending_pruning_and_growing() {
+        let mut ledger = Ledger::default();
+        [(0, 4), (2, 3), (5, 2)].into_iter().for_each(|(keyframe, count)| ledger.append(keyframe, count));
+        ledger.apply(&[0, 3, 4, 6, 8], [1, 5, 5].into_iter());
+        let shift = Se3::translation(1.0, 0.0, 0.0);
+        let motions = BTreeMap::from([(2, shift), (5, shift), (7, shift)]);
+        assert_eq!(ledger.moved(&motions), [(2..4, shift), (4..5, shift), (6..8, shift)]);
+        assert!(ledger.moved(&BTreeMap::new()).is_empty());
+    }
+
+    #[test]
+    fn what_a_camera_sees_moves_with_it_but_not_for_a_refinement() {
+        let old = Se3::new(Vector3::new(1.0, 2.0, 3.0), Vector3::new(0.1, -0.4, 0.2));
+        let new = old * Se3::new(Vector3::new(0.05, 0.0, 0.0), Vector3::new(0.0, 0.03, 0.0));
+        let p_in_camera = Point3::new(0.3, -0.2, 2.0);
+        let moved = motion(&old, &new).unwrap() * (old * p_in_camera);
+        assert!((moved - new * p_in_camera).norm() < 1e-12);
+        assert!(motion(&old, &(old * Se3::new(Vector3::new(0.0, 0.009, 0.0), Vector3::new(0.008, 0.0, 0.0)))).is_none());
+        assert!(motion(&old, &(old * Se3::new(Vector3::zeros(), Vector3::new(0.01, 0.0, 0.0)))).is_some());
+    }
+}
