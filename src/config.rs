@@ -29,6 +29,7 @@ pub struct Config {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SequenceConfig {
+    /// A folder, or a video.
     pub path: PathBuf,
     /// Recognised where absent.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -36,7 +37,7 @@ pub struct SequenceConfig {
     /// Replay what a sensor of this kind would have given.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub sensor: Option<SensorKind>,
-    /// A camera preset instead of what the recording says.
+    /// A camera preset instead of what the recording says; for a video, or the path of a `camera.toml`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub camera: Option<String>,
 }

@@ -1,12 +1,19 @@
-//! Real recordings in their layouts; skipped where `KEYSPLAT_DATA` names no folder with them.
+//! Real recordings in their layouts, skipped where `KEYSPLAT_DATA` names no folder with them; and a video through the whole program.
+
+mod common;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use common::recording::{finish, keysplat, metrics, run_command, scene, scratch, skipped_without_adapter, stamps, truncate};
 use image::RgbImage;
+use keysplat::config::Config;
 use keysplat::geometry::Se3;
+use keysplat::sequence::synthetic::{self, CameraConfig, SceneConfig};
 use keysplat::sequence::{Layout, Sensor, Sequence};
 use nalgebra::Point3;
+use opencv::core::{Mat, MatTraitConst, Size};
+use opencv::videoio::{VideoWriter, VideoWriterTrait};
 
 /// The recording's folder in `$KEYSPLAT_DATA`; says so where there is none.
 fn recorded(name: &str) -> Option<PathBuf> {
@@ -57,4 +64,58 @@ fn photos_of_bonsai_show_the_points_of_their_model() {
         let (own, other) = (difference_seen_from(index), difference_seen_from((index + 30) % 292));
         assert!(own * 2 < other, "photo {index}: its points differ by {own}, those of another pose by {other}");
     }
+}
+
+const VIDEO_FRAMES: usize = 40;
+const VIDEO_FPS: f64 = 15.0;
+
+/// A synthetic walk as Motion JPEG in AVI, its calibration in another folder: `(video, camera.toml)`.
+fn video() -> (PathBuf, PathBuf) {
+    let room = scratch().join("room");
+    let camera = CameraConfig { width: 320, height: 240, fx: 262.5, fy: 262.5, cx: 159.5, cy: 119.5, ..CameraConfig::default() };
+    let walk = SceneConfig { camera, frames: VIDEO_FRAMES, fps: VIDEO_FPS, ..scene() };
+    synthetic::generate(&walk, &room, &|_, _| {}).unwrap();
+    let (path, calibration) = (scratch().join("walk.avi"), scratch().join("calibrations/own.toml"));
+    let codec = VideoWriter::fourcc('M', 'J', 'P', 'G').unwrap();
+    let mut writer = VideoWriter::new(path.to_str().unwrap(), codec, VIDEO_FPS, Size::new(320, 240), true).unwrap();
+    let images = Sequence::open(&room, None, None).unwrap();
+    for index in 0..VIDEO_FRAMES {
+        let mut values = images.load(index).unwrap().color.into_raw();
+        values.chunks_exact_mut(3).for_each(|pixel| pixel.swap(0, 2));
+        writer.write(&Mat::from_slice(&values).unwrap().reshape(3, 240).unwrap()).unwrap();
+    }
+    writer.release().unwrap();
+    std::fs::create_dir(calibration.parent().unwrap()).unwrap();
+    let pinhole = "[pinhole]\nfx = 262.5\nfy = 262.5\ncx = 159.5\ncy = 119.5\nwidth = 320\nheight = 240\n";
+    std::fs::write(&calibration, pinhole).unwrap();
+    (path, calibration)
+}
+
+/// A video that was not copied whole is mapped from what is there, and what is missing is counted.
+#[test]
+fn a_video_is_tracked_mapped_and_measured_again() {
+    if skipped_without_adapter() {
+        return;
+    }
+    let (video, calibration) = video();
+    truncate(&video, std::fs::metadata(&video).unwrap().len() * 9 / 10);
+    let out = scratch().join("video-out");
+    let mut run = run_command(Path::new("walk.avi"), &out, &["--camera", "calibrations/own.toml", "--map-scale", "0.25"]);
+    run.args(["--frames", "2.."]).current_dir(scratch());
+    let said = finish(run).succeeded();
+    let run = metrics(&out);
+    assert_eq!((run.sequence.as_str(), run.frames), ("walk", VIDEO_FRAMES as u64 - 2));
+    assert!((1..12).contains(&run.frames_read_failed), "{} frames", run.frames_read_failed);
+    assert!(said.stderr.contains("frame 39 of ") && said.stderr.contains("walk.avi cannot be decoded"), "{}", said.stderr);
+    assert!(run.frames_tracked >= 8, "{} frames tracked", run.frames_tracked);
+    let on_the_grid = |stamp: &String| (stamp.parse::<f64>().unwrap() * VIDEO_FPS + 1e-3).fract() < 2e-3;
+    assert!(stamps(&out.join("trajectory.txt")).iter().all(on_the_grid));
+    let named = Config::read(&out.join("config.toml")).unwrap().sequence.unwrap();
+    assert_eq!((named.path, named.camera.as_deref()), (video, calibration.to_str()));
+    // Later, and from elsewhere: the same frames again.
+    finish(keysplat([Path::new("eval"), &out])).succeeded();
+    let (first, again) = (run.images.all_frames.unwrap(), metrics(&out).images.all_frames.unwrap());
+    assert_eq!(first.count, again.count);
+    // Poses are read back with the digits of their file.
+    assert!((first.psnr_db.unwrap() - again.psnr_db.unwrap()).abs() < 1e-4, "{first:?}, then {again:?}");
 }

@@ -10,14 +10,14 @@ use indicatif::ProgressBar;
 use keysplat::config::{Config, SequenceConfig};
 use keysplat::gpu::Gpu;
 use keysplat::pipeline::{self, Outcome, PipelineError, Progress, outputs};
-use keysplat::sequence::{Layout, Sensor, SensorKind, Sequence};
+use keysplat::sequence::{Layout, Sensor, SensorKind, Sequence, is_camera_file};
 use miette::{IntoDiagnostic, miette};
 
 use super::{Verbosity, print_metrics, progress};
 
 #[derive(Args)]
 pub struct RunArgs {
-    /// Folder of the recording; may also stand in the configuration.
+    /// Folder of the recording, or a video; may also stand in the configuration.
     sequence: Option<PathBuf>,
     /// Folder for the results.
     #[arg(short, long)]
@@ -31,7 +31,7 @@ pub struct RunArgs {
     /// Use of the recording only what a sensor of this kind gives.
     #[arg(long, value_enum)]
     sensor: Option<SensorKind>,
-    /// Camera preset to use instead of the recording's own calibration.
+    /// Camera preset to use instead of the recording's own calibration; for a video, or the path of a camera.toml.
     #[arg(long)]
     camera: Option<String>,
     /// Mapping resolution as a share of the recorded one, e.g. 0.5.
@@ -54,6 +54,11 @@ pub struct RunArgs {
     set: Vec<String>,
 }
 
+/// The same file, named from the root.
+fn absolute(path: &str) -> miette::Result<String> {
+    Ok(std::path::absolute(path).into_diagnostic()?.to_string_lossy().into_owned())
+}
+
 fn parse_range(text: &str) -> Result<(usize, usize), String> {
     let wrong = || format!("`{text}` is no range; write A..B, like 0..200, with A below B");
     let (start, end) = text.split_once("..").ok_or_else(wrong)?;
@@ -73,10 +78,12 @@ impl RunArgs {
         let sequence = config
             .sequence
             .as_mut()
-            .ok_or_else(|| miette!("which recording? Give its folder: keysplat run <SEQUENCE> --out <DIR>"))?;
+            .ok_or_else(|| miette!("which recording? Give its folder or video: keysplat run <SEQUENCE> --out <DIR>"))?;
         sequence.layout = self.layout.or(sequence.layout);
         sequence.sensor = self.sensor.or(sequence.sensor);
-        sequence.camera = self.camera.clone().or(sequence.camera.take());
+        if let Some(camera) = &self.camera {
+            sequence.camera = Some(if is_camera_file(camera) { absolute(camera)? } else { camera.clone() });
+        }
         config.map_scale = self.map_scale.unwrap_or(config.map_scale);
         config.replay.every = self.every.unwrap_or(config.replay.every);
         config.replay.frames = self.frames.or(config.replay.frames);
@@ -97,6 +104,9 @@ pub fn run(args: RunArgs, verbosity: Verbosity) -> miette::Result<()> {
 /// ends with it.
 pub fn open(config: &mut Config) -> miette::Result<Sequence> {
     let named = config.sequence.as_ref().ok_or_else(|| miette!("the configuration names no recording"))?;
+    if named.path.is_file() {
+        tracing::info!("decoding {} for the times of its frames", named.path.display());
+    }
     let mut sequence = Sequence::open(&named.path, named.layout, named.camera.as_deref()).into_diagnostic()?;
     if let Some(kind) = named.sensor {
         sequence.restrict_to(kind).into_diagnostic()?;

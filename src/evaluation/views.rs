@@ -61,8 +61,10 @@ pub fn evaluate_views(
     let [mut held_out, mut all_frames, mut monogs] = [ImageMeans::default(); 3];
     for (batch, poses) in selection.poses.chunks(BATCH).enumerate() {
         progress(batch * BATCH);
+        let indices: Vec<usize> = poses.iter().map(|(index, _)| *index).collect();
+        let frames = sequence.load_all(&indices);
         let recorded: Vec<Option<RectifiedImage>> =
-            poses.par_iter().map(|(index, _)| Some(rectifier.rectify(&sequence.load(*index).ok()?))).collect();
+            frames.into_par_iter().map(|frame| Some(rectifier.rectify(&frame.ok()?))).collect();
         let mut views = Vec::new();
         for ((index, world_from_camera), recorded) in poses.iter().zip(recorded) {
             let Some(recorded) = recorded else { continue };

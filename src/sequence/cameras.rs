@@ -32,6 +32,11 @@ pub fn names() -> Vec<&'static str> {
     PRESETS.keys().map(String::as_str).collect()
 }
 
+/// Whether `name` is the path of a camera's file rather than a preset's name.
+pub fn is_file(name: &str) -> bool {
+    name.ends_with(".toml")
+}
+
 /// The preset called `name`.
 pub fn by_name(name: &str) -> Result<Camera, SequenceError> {
     PRESETS.get(name).map(Preset::camera).ok_or_else(|| SequenceError::UnknownCamera { name: name.into() })

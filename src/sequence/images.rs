@@ -28,27 +28,27 @@ use serde::Deserialize;
 use super::{FrameEntry, Layout, Sensor, Sequence, SequenceError, checks, folder_name, images_in, read_text};
 use crate::geometry::{Camera, Distortion, Pinhole};
 
-const FILE: &str = "camera.toml";
+pub(super) const FILE: &str = "camera.toml";
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-struct CameraFile {
+pub(super) struct CameraFile {
     pinhole: Pinhole,
     #[serde(default)]
     distortion: Distortion,
     depth_units_per_metre: Option<f64>,
     #[serde(default = "usual_fps")]
-    fps: f64,
-    stereo: Option<StereoTable>,
+    pub fps: f64,
+    pub stereo: Option<StereoTable>,
 }
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-struct StereoTable {
+pub(super) struct StereoTable {
     baseline_metres: f64,
 }
 
-fn usual_fps() -> f64 {
+pub(super) fn usual_fps() -> f64 {
     30.0
 }
 
@@ -59,13 +59,7 @@ pub(super) fn recognise(folder: &Path) -> bool {
 pub(super) fn open(folder: &Path) -> Result<Sequence, SequenceError> {
     let path = folder.join(FILE);
     let content = |what: &str| SequenceError::Content { path: path.clone(), what: what.into() };
-    let file = read_camera_file(&path)?;
-    let depth_units_per_metre = file.depth_units_per_metre.unwrap_or(1.0);
-    let camera = checks::camera(Camera { pinhole: file.pinhole, distortion: file.distortion, depth_units_per_metre })
-        .map_err(|what| content(&what))?;
-    if !(file.fps.is_finite() && file.fps > 0.0) {
-        return Err(content("fps must be positive"));
-    }
+    let (camera, file) = read_camera(&path)?;
     let rgb = folder.join("rgb");
     let (color_folder, other_folder, sensor) = match file.stereo {
         Some(StereoTable { baseline_metres }) => {
@@ -90,6 +84,18 @@ pub(super) fn open(folder: &Path) -> Result<Sequence, SequenceError> {
     let sequence = Sequence::new(folder_name(folder), Layout::Images, camera, sensor, entries);
     sequence.check_first_size()?;
     Ok(sequence)
+}
+
+/// Reads a camera's file and checks its numbers.
+pub(super) fn read_camera(path: &Path) -> Result<(Camera, CameraFile), SequenceError> {
+    let content = |what: String| SequenceError::Content { path: path.into(), what };
+    let file = read_camera_file(path)?;
+    let depth_units_per_metre = file.depth_units_per_metre.unwrap_or(1.0);
+    let camera = checks::camera(Camera { pinhole: file.pinhole, distortion: file.distortion, depth_units_per_metre });
+    if !(file.fps.is_finite() && file.fps > 0.0) {
+        return Err(content("fps must be positive".into()));
+    }
+    Ok((camera.map_err(content)?, file))
 }
 
 fn read_camera_file(path: &Path) -> Result<CameraFile, SequenceError> {

@@ -6,6 +6,7 @@ mod cameras;
 mod checks;
 mod colmap;
 mod euroc;
+mod files;
 mod images;
 mod kitti;
 mod rectify;
@@ -14,18 +15,23 @@ mod stereo;
 pub mod synthetic;
 mod transforms;
 mod tum;
+mod video;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use image::{GrayImage, RgbImage};
 use nalgebra::Vector3;
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::geometry::{Camera, Trajectory, TrajectoryError};
 
+pub use cameras::is_file as is_camera_file;
+use files::{decode, files_in, folder_name, images_in, read_json, read_text};
 pub use rectify::{RectifiedImage, Rectifier};
 use stereo::StereoRemap;
+use video::Video;
 
 /// How a dataset lays out its files.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
@@ -43,12 +49,15 @@ pub enum Layout {
     Replica,
     /// `transforms.json`, as NeRF's data, instant-ngp and nerfstudio have it: photos whose poses are known.
     Transforms,
+    /// A video file, its `camera.toml` beside it; or the folder that holds just these.
+    Video,
     /// `camera.toml` and images in the folder itself, in `rgb` and perhaps `depth`, or in `left` and `right`.
     Images,
 }
 
 impl Layout {
-    pub const ALL: [Self; 7] = [Self::Tum, Self::Kitti, Self::Euroc, Self::Colmap, Self::Replica, Self::Transforms, Self::Images];
+    pub const ALL: [Self; 8] =
+        [Self::Tum, Self::Kitti, Self::Euroc, Self::Colmap, Self::Replica, Self::Transforms, Self::Video, Self::Images];
 
     /// The layouts with their marker files, for messages.
     fn known() -> String {
@@ -59,6 +68,7 @@ impl Layout {
             Self::Colmap => "colmap: has images and sparse/0",
             Self::Replica => "replica: has traj.txt and results",
             Self::Transforms => "transforms: has transforms.json",
+            Self::Video => "video: has camera.toml and a video",
             Self::Images => "images: has camera.toml",
         };
         Self::ALL.map(of).join(", ")
@@ -73,6 +83,7 @@ impl Layout {
             Self::Colmap => colmap::recognise(folder),
             Self::Replica => replica::recognise(folder),
             Self::Transforms => transforms::recognise(folder),
+            Self::Video => video::recognise(folder),
             Self::Images => images::recognise(folder),
         })
     }
@@ -152,6 +163,7 @@ pub struct Frame {
 #[derive(Clone, Debug, PartialEq)]
 pub struct FrameEntry {
     pub timestamp_s: f64,
+    /// An image; or the video whose frame at that time it is.
     pub color: PathBuf,
     pub depth: Option<PathBuf>,
     /// The right image of a stereo pair.
@@ -180,14 +192,20 @@ pub struct Sequence {
     pub points: Vec<KnownPoint>,
     /// Turns raw stereo pairs into those that `camera` and `sensor` describe, when they are loaded.
     remap: Option<Arc<StereoRemap>>,
+    /// What the frames are decoded from where they are no images.
+    video: Option<Arc<Video>>,
 }
 
 #[derive(Debug, thiserror::Error)]
 pub enum SequenceError {
-    #[error("there is no folder {0}; give the folder that holds the recording")]
+    #[error("there is no folder or video {0}; give the folder that holds the recording, or its video")]
     Missing(PathBuf),
     #[error("{0} is no recording in a layout that we know ({known}); check the folder, or name its layout with --layout", known = Layout::known())]
     UnknownLayout(PathBuf),
+    #[error("{path} is no video that we know (MP4, MOV, AVI, MKV, WebM); give one, or give the folder that holds the recording")]
+    NoVideo { path: PathBuf },
+    #[error("frame {frame} of {path} cannot be decoded; the video is damaged, or was not copied whole")]
+    VideoFrame { path: PathBuf, frame: usize },
     #[error("{name} is a {found} recording and cannot be replayed as {wanted}; leave --sensor out, or say mono")]
     NoSuchSensor { name: String, wanted: SensorKind, found: SensorKind },
     #[error("cannot read {path}: {source}")]
@@ -202,7 +220,7 @@ pub enum SequenceError {
     MissingImage { list: PathBuf, line: usize, image: PathBuf },
     #[error("{folder}: no camera.txt, and the folder's name says no known camera ({known}); add camera.txt with `fx fy cx cy width height depth_units_per_metre k1 k2 p1 p2`, or name one with --camera", known = cameras::names().join(", "))]
     NoCamera { folder: PathBuf },
-    #[error("no camera is called `{name}`; known are {known}", known = cameras::names().join(", "))]
+    #[error("no camera is called `{name}`; known are {known}; for a video, give the path of a camera.toml", known = cameras::names().join(", "))]
     UnknownCamera { name: String },
     #[error("{path} is {found_width}x{found_height}, but the camera is {width}x{height}; images, depth and camera must agree")]
     Size { path: PathBuf, width: u32, height: u32, found_width: u32, found_height: u32 },
@@ -217,9 +235,13 @@ pub enum SequenceError {
 }
 
 impl Sequence {
-    /// Opens a recording: finds its layout unless named, reads and checks its lists, camera and truth. No image is decoded.
-    /// `camera` names a preset (`tum-fr1`, …) to use instead of what a folder in TUM's layout says.
+    /// Opens a recording, a folder or a video: finds its layout unless named, reads and checks its lists, camera and truth. No image is
+    /// decoded, but a video is, once, for the times of its frames.
+    /// `camera` names a preset (`tum-fr1`, …) to use instead of what a folder in TUM's layout says; for a video, also a `camera.toml`.
     pub fn open(folder: &Path, layout: Option<Layout>, camera: Option<&str>) -> Result<Self, SequenceError> {
+        if folder.is_file() && layout.is_none_or(|layout| layout == Layout::Video) {
+            return video::open(folder, camera);
+        }
         if !folder.is_dir() {
             return Err(SequenceError::Missing(folder.into()));
         }
@@ -231,13 +253,14 @@ impl Sequence {
             Layout::Colmap => colmap::open(folder),
             Layout::Replica => replica::open(folder),
             Layout::Transforms => transforms::open(folder),
+            Layout::Video => video::open(folder, camera),
             Layout::Images => images::open(folder),
         }
     }
 
     /// A recording without truth and known points.
     fn new(name: String, layout: Layout, camera: Camera, sensor: Sensor, entries: Vec<FrameEntry>) -> Self {
-        Self { name, layout, camera, sensor, entries, groundtruth: None, points: Vec::new(), remap: None }
+        Self { name, layout, camera, sensor, entries, groundtruth: None, points: Vec::new(), remap: None, video: None }
     }
 
     /// Takes from the recording only what a sensor of this kind gives: a monocular replay of an RGB-D recording leaves its depth out.
@@ -267,10 +290,21 @@ impl Sequence {
         Ok(())
     }
 
-    /// Decodes frame `index`.
+    /// Decodes several frames: images side by side, those of a video one after the other.
+    pub fn load_all(&self, indices: &[usize]) -> Vec<Result<Frame, SequenceError>> {
+        match &self.video {
+            Some(_) => indices.iter().map(|index| self.load(*index)).collect(),
+            None => indices.par_iter().map(|index| self.load(*index)).collect(),
+        }
+    }
+
+    /// Decodes frame `index`. In a video this is quick for the frames after the last one loaded; any other begins at the first again.
     pub fn load(&self, index: usize) -> Result<Frame, SequenceError> {
         let entry = &self.entries[index];
-        let color = decode(&entry.color)?;
+        let color = match &self.video {
+            Some(video) => video.load(entry.timestamp_s)?.into(),
+            None => decode(&entry.color)?,
+        };
         self.check_size(&entry.color, (color.width(), color.height()))?;
         let color = match &self.remap {
             Some(remap) => remap.left(color),
@@ -325,41 +359,4 @@ impl Sequence {
             Err(SequenceError::Size { path: path.into(), width, height, found_width, found_height })
         }
     }
-}
-
-/// The folder's own name, also of `.`.
-fn folder_name(folder: &Path) -> String {
-    let name = folder.canonicalize().ok().and_then(|p| p.file_name().map(|n| n.to_string_lossy().into_owned()));
-    name.unwrap_or_else(|| "sequence".into())
-}
-
-fn read_text(path: &Path) -> Result<String, SequenceError> {
-    std::fs::read_to_string(path).map_err(|source| SequenceError::Read { path: path.into(), source })
-}
-
-fn read_json<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T, SequenceError> {
-    serde_json::from_str(&read_text(path)?).map_err(|error| SequenceError::Syntax {
-        path: path.into(),
-        line: error.line(),
-        what: error.to_string(),
-    })
-}
-
-/// The pictures in a folder, by name.
-fn images_in(folder: &Path) -> Result<Vec<PathBuf>, SequenceError> {
-    let is_picture = |path: &PathBuf| {
-        let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
-        extension.is_some_and(|e| ["png", "jpg", "jpeg"].contains(&e.as_str()))
-    };
-    let entries = std::fs::read_dir(folder).map_err(|source| SequenceError::Read { path: folder.into(), source })?;
-    let mut images: Vec<PathBuf> = entries.filter_map(|e| Some(e.ok()?.path())).filter(is_picture).collect();
-    images.sort();
-    Ok(images)
-}
-
-fn decode(path: &Path) -> Result<image::DynamicImage, SequenceError> {
-    let reader = image::ImageReader::open(path)
-        .and_then(image::ImageReader::with_guessed_format)
-        .map_err(|source| SequenceError::Read { path: path.into(), source })?;
-    reader.decode().map_err(|source| SequenceError::Image { path: path.into(), source })
 }

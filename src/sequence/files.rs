@@ -1,0 +1,50 @@
+//! Reading the files of a recording, whatever its layout.
+
+use std::path::{Path, PathBuf};
+
+use super::SequenceError;
+
+/// The folder's own name, also of `.`.
+pub fn folder_name(folder: &Path) -> String {
+    let name = folder.canonicalize().ok().and_then(|p| p.file_name().map(|n| n.to_string_lossy().into_owned()));
+    name.unwrap_or_else(|| "sequence".into())
+}
+
+/// A whole file of UTF-8.
+pub fn read_text(path: &Path) -> Result<String, SequenceError> {
+    std::fs::read_to_string(path).map_err(|source| SequenceError::Read { path: path.into(), source })
+}
+
+/// A JSON file as what it should hold; what does not fit is named with its line.
+pub fn read_json<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T, SequenceError> {
+    serde_json::from_str(&read_text(path)?).map_err(|error| SequenceError::Syntax {
+        path: path.into(),
+        line: error.line(),
+        what: error.to_string(),
+    })
+}
+
+/// The pictures in a folder, by name.
+pub fn images_in(folder: &Path) -> Result<Vec<PathBuf>, SequenceError> {
+    files_in(folder, &["png", "jpg", "jpeg"])
+}
+
+/// What a folder holds with one of these extensions (lower case), by name.
+pub fn files_in(folder: &Path, extensions: &[&str]) -> Result<Vec<PathBuf>, SequenceError> {
+    let wanted = |path: &PathBuf| {
+        let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
+        extension.is_some_and(|e| extensions.contains(&e.as_str()))
+    };
+    let entries = std::fs::read_dir(folder).map_err(|source| SequenceError::Read { path: folder.into(), source })?;
+    let mut files: Vec<PathBuf> = entries.filter_map(|e| Some(e.ok()?.path())).filter(wanted).collect();
+    files.sort();
+    Ok(files)
+}
+
+/// Decodes an image, of the format that its bytes say.
+pub fn decode(path: &Path) -> Result<image::DynamicImage, SequenceError> {
+    let reader = image::ImageReader::open(path)
+        .and_then(image::ImageReader::with_guessed_format)
+        .map_err(|source| SequenceError::Read { path: path.into(), source })?;
+    reader.decode().map_err(|source| SequenceError::Image { path: path.into(), source })
+}
