@@ -28,7 +28,7 @@ pub struct MappingConfig {
 impl Default for MappingConfig {
     fn default() -> Self {
         Self {
-            sh_degree: ShDegree::default(),
+            sh_degree: ShDegree::new(1).expect("degrees 0 to 3 exist"),
             iterations_per_keyframe: 50,
             first_iterations: 100,
             seed: 0,
