@@ -19,6 +19,7 @@ pub struct MappingConfig {
     /// Seed of the draws among keyframes.
     pub seed: u64,
     pub window: WindowConfig,
+    pub skip: SkipConfig,
     pub seeding: SeedingConfig,
     pub density: DensityConfig,
     pub loss: LossConfig,
@@ -33,6 +34,7 @@ impl Default for MappingConfig {
             first_iterations: 100,
             seed: 0,
             window: WindowConfig::default(),
+            skip: SkipConfig::default(),
             seeding: SeedingConfig::default(),
             density: DensityConfig::default(),
             loss: LossConfig::default(),
@@ -55,7 +57,25 @@ pub struct WindowConfig {
 
 impl Default for WindowConfig {
     fn default() -> Self {
-        Self { recent: 6, covisible: 3, older_share: 0.35 }
+        Self { recent: 6, covisible: 3, older_share: 0.6 }
+    }
+}
+
+/// Work that is left out where little is to be gained.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SkipConfig {
+    /// Older keyframes are drawn in proportion to their loss, not evenly.
+    pub draw_by_loss: bool,
+    /// The first steps after a keyframe, this share of them, are taken at half the size.
+    pub coarse_share: f32,
+    /// The steps after a keyframe end when ten of them lower the loss of their views by less than this share; 0: never.
+    pub min_gain: f32,
+}
+
+impl Default for SkipConfig {
+    fn default() -> Self {
+        Self { draw_by_loss: true, coarse_share: 0.0, min_gain: 0.0 }
     }
 }
 
@@ -109,6 +129,8 @@ impl MappingConfig {
         }
         let shares = [
             ("window.older_share", self.window.older_share),
+            ("skip.coarse_share", self.skip.coarse_share),
+            ("skip.min_gain", self.skip.min_gain),
             ("seeding.min_alpha", s.min_alpha),
             ("seeding.opacity", s.opacity),
         ];

@@ -1,9 +1,11 @@
 //! A keyframe as the mapper receives and keeps it.
 
-use crate::geometry::Se3;
+use image::{Rgb, RgbImage};
+
+use crate::geometry::{Pinhole, Se3};
 use crate::gpu::{Gpu, GpuError};
-use crate::optimise::TargetImage;
-use crate::sequence::RectifiedImage;
+use crate::optimise::{TargetImage, TrainingView, WrongPixels};
+use crate::sequence::{DepthImage, RectifiedImage};
 use crate::splat::ViewCamera;
 
 /// The tracker's number of a keyframe.
@@ -24,18 +26,77 @@ pub struct Keyframe {
 pub(super) struct MappedKeyframe {
     pub id: KeyframeId,
     pub camera: ViewCamera,
-    pub target: TargetImage,
+    target: TargetImage,
+    /// The same at half the size, where it is wanted.
+    half: Option<TargetImage>,
     pub covisible: Vec<KeyframeId>,
+    /// At its last step; 1 before.
+    pub loss: f32,
 }
 
 impl MappedKeyframe {
-    pub fn new(gpu: &Gpu, keyframe: &Keyframe) -> Result<Self, GpuError> {
-        let depth = keyframe.image.depth.as_ref().map(|d| d.metres.as_slice());
+    /// Uploads the images; `with_half` also at half the size, if that is still an image worth comparing.
+    pub fn new(gpu: &Gpu, keyframe: &Keyframe, with_half: bool) -> Result<Self, GpuError> {
+        let target = |image: &RectifiedImage| {
+            let depth = image.depth.as_ref().map(|d| d.metres.as_slice());
+            TargetImage::new(gpu, &image.color, depth)
+        };
+        let image = &keyframe.image;
+        let worth = with_half && image.pinhole.width.min(image.pinhole.height) >= MIN_HALVED;
         Ok(Self {
             id: keyframe.id,
-            camera: ViewCamera { pinhole: keyframe.image.pinhole, camera_from_world: keyframe.world_from_camera.inverse() },
-            target: TargetImage::new(gpu, &keyframe.image.color, depth)?,
+            camera: ViewCamera { pinhole: image.pinhole, camera_from_world: keyframe.world_from_camera.inverse() },
+            target: target(image)?,
+            half: worth.then(|| target(&halved(image))).transpose()?,
             covisible: keyframe.covisible.clone(),
+            loss: 1.0,
         })
     }
+
+    /// What a step learns from; coarse where that is wished and there is a smaller image.
+    pub fn view(&self, coarse: bool, scored: Option<WrongPixels>) -> TrainingView<'_> {
+        match self.half.as_ref().filter(|_| coarse) {
+            None => TrainingView { camera: self.camera, target: &self.target, scored },
+            Some(target) => {
+                let pinhole = halved_pinhole(&self.camera.pinhole);
+                TrainingView { camera: ViewCamera { pinhole, ..self.camera }, target, scored }
+            }
+        }
+    }
 }
+
+/// Shorter sides below this many pixels are not halved.
+const MIN_HALVED: u32 = 64;
+
+/// Of an image whose odd last row or column is left out.
+fn halved_pinhole(p: &Pinhole) -> Pinhole {
+    let half = |c: f64| (c + 0.5) * 0.5 - 0.5;
+    Pinhole { fx: 0.5 * p.fx, fy: 0.5 * p.fy, cx: half(p.cx), cy: half(p.cy), width: p.width / 2, height: p.height / 2 }
+}
+
+/// Means of 2×2 pixels; of the depths only those that are measured and on the nearest surface.
+fn halved(image: &RectifiedImage) -> RectifiedImage {
+    let pinhole = halved_pinhole(&image.pinhole);
+    let block = |x: u32, y: u32| [(0, 0), (1, 0), (0, 1), (1, 1)].map(|(dx, dy)| (2 * x + dx, 2 * y + dy));
+    let color = RgbImage::from_fn(pinhole.width, pinhole.height, |x, y| {
+        let sum = block(x, y).map(|(x, y)| image.color.get_pixel(x, y).0.map(u32::from)).into_iter().fold([2; 3], |sum, c| {
+            [sum[0] + c[0], sum[1] + c[1], sum[2] + c[2]]
+        });
+        Rgb(sum.map(|s| (s / 4) as u8))
+    });
+    let depth = image.depth.as_ref().map(|depth| {
+        let mean = |i: u32| {
+            let measured = block(i % pinhole.width, i / pinhole.width).map(|(x, y)| depth.at(x, y).unwrap_or(f32::INFINITY));
+            let nearest = measured.into_iter().fold(f32::INFINITY, f32::min);
+            let near = || measured.iter().filter(|m| m.is_finite() && **m < SAME_SURFACE * nearest);
+            let count = near().count();
+            if count > 0 { near().sum::<f32>() / count as f32 } else { 0.0 }
+        };
+        let metres = (0..pinhole.width * pinhole.height).map(mean).collect();
+        DepthImage { width: pinhole.width, height: pinhole.height, metres }
+    });
+    RectifiedImage { pinhole, color, depth }
+}
+
+/// Depths within this factor of each other are on one surface.
+const SAME_SURFACE: f32 = 1.1;

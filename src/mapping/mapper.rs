@@ -10,6 +10,7 @@ use glam::{Quat, Vec3};
 use super::density::{self, Candidate};
 use super::keyframe::MappedKeyframe;
 use super::ledger::{self, Ledger};
+use super::schedule::{self, Session, Step};
 use super::{Keyframe, KeyframeId, MappingConfig, seeding};
 use crate::geometry::Se3;
 use crate::gpu::{Gpu, GpuError};
@@ -81,7 +82,7 @@ impl Mapper {
         if keyframe.image.depth.is_none() && self.keyframes.is_empty() {
             return Err(MappingError::NoDepth { id: keyframe.id });
         }
-        let mapped = MappedKeyframe::new(&self.gpu, keyframe)?;
+        let mapped = MappedKeyframe::new(&self.gpu, keyframe, self.config.skip.coarse_share > 0.0)?;
         let seeded = self.seed(keyframe, &mapped.camera)?;
         self.keyframes.push(mapped);
         let first = self.keyframes.len() == 1;
@@ -164,23 +165,28 @@ impl Mapper {
         Ok((before - plan.keep.len() - children / 2, children / 2))
     }
 
+    /// Steps over the window until all are taken or nothing more is gained, the last of them scoring the Gaussians; returns their number and
+    /// the mean PSNR before each.
     fn optimise(&mut self, iterations: usize, stop: &dyn Fn() -> bool) -> Result<(usize, f32), MappingError> {
-        let window = self.window();
-        let mut psnr_sum = 0.0;
-        let mut done = 0;
-        while done < iterations && !stop() && !self.cloud.is_empty() {
-            let batch: Vec<usize> = (done..iterations.min(done + BATCH)).map(|step| self.draw(&window, step)).collect();
-            let reports = self.steps(&batch, None)?;
-            for (report, &index) in reports.iter().zip(&batch) {
-                if !report.loss.total(&self.config.loss).is_finite() {
-                    return Err(MappingError::NotFinite { id: self.keyframes[index].id });
-                }
-                psnr_sum += report.loss.psnr_db();
-            }
-            done += batch.len();
+        if self.cloud.is_empty() {
+            return Ok((0, 0.0));
         }
-        done += self.score(&window)?;
-        Ok((done, psnr_sum / done.max(1) as f32))
+        let window = schedule::window(&self.keyframes, &self.config.window);
+        let mut session = Session::new(window.clone(), iterations);
+        let (mut psnr_sum, mut done) = (0.0, 0);
+        while !stop() {
+            let config = (&self.config.window, &self.config.skip);
+            let batch = session.next(BATCH, &self.keyframes, &mut self.rng, config);
+            let reports = self.steps(&batch, None)?;
+            psnr_sum += reports.iter().map(|r| r.loss.psnr_db()).sum::<f32>();
+            done += batch.len();
+            let losses: Vec<f32> = reports.iter().map(|r| r.loss.total(&self.config.loss)).collect();
+            if !session.goes_on(&batch, &losses, self.config.skip.min_gain) {
+                break;
+            }
+        }
+        let psnr_db = psnr_sum / done.max(1) as f32;
+        Ok((done + self.score(&window)?, psnr_db))
     }
 
     /// A last step of each of some keyframes of the window, evenly spread over it, that scores the Gaussians; returns their number.
@@ -188,39 +194,23 @@ impl Mapper {
         let Some(wrong) = self.config.density.scored() else { return Ok(0) };
         self.optimiser.begin_scores(&self.gpu, &self.cloud)?;
         let views = self.config.density.views.min(window.len());
-        let chosen: Vec<usize> = (0..views).map(|k| window[k * window.len() / views]).collect();
+        let chosen: Vec<Step> =
+            (0..views).map(|k| Step { keyframe: window[k * window.len() / views], coarse: false }).collect();
         Ok(self.steps(&chosen, Some(wrong))?.len())
     }
 
-    fn steps(&mut self, batch: &[usize], scored: Option<WrongPixels>) -> Result<Vec<StepReport>, GpuError> {
-        let view = |&index: &usize| {
-            let MappedKeyframe { camera, target, .. } = &self.keyframes[index];
-            TrainingView { camera: *camera, target, scored }
-        };
-        let views: Vec<TrainingView<'_>> = batch.iter().map(view).collect();
+    fn steps(&mut self, batch: &[Step], scored: Option<WrongPixels>) -> Result<Vec<StepReport>, MappingError> {
+        let views: Vec<TrainingView<'_>> = batch.iter().map(|step| self.keyframes[step.keyframe].view(step.coarse, scored)).collect();
         let started = Instant::now();
         let reports = self.optimiser.steps(&mut self.rasterizer, &self.cloud, &views, (&self.config.loss, &self.config.adam))?;
         self.step_times.extend(std::iter::repeat_n(started.elapsed() / batch.len().max(1) as u32, batch.len()));
-        Ok(reports)
-    }
-
-    /// Indices of the newest keyframes and of the older ones that share most landmarks with the newest.
-    fn window(&self) -> Vec<usize> {
-        let len = self.keyframes.len();
-        let recent = len.saturating_sub(self.config.window.recent);
-        let mut window: Vec<usize> = (recent..len).rev().collect();
-        let covisible = &self.keyframes[len - 1].covisible;
-        let older = covisible.iter().filter_map(|id| self.keyframes[..recent].binary_search_by_key(id, |k| k.id).ok());
-        window.extend(older.take(self.config.window.covisible));
-        window
-    }
-
-    /// The keyframe of the next step: the window in turn, newest first, and now and then any older one.
-    fn draw(&mut self, window: &[usize], step: usize) -> usize {
-        let older = self.keyframes.len().saturating_sub(self.config.window.recent);
-        if older > 0 && self.rng.f32() < self.config.window.older_share {
-            return self.rng.usize(..older);
+        for (step, report) in batch.iter().zip(&reports) {
+            let keyframe = &mut self.keyframes[step.keyframe];
+            keyframe.loss = report.loss.total(&self.config.loss);
+            if !keyframe.loss.is_finite() {
+                return Err(MappingError::NotFinite { id: keyframe.id });
+            }
         }
-        window[step % window.len()]
+        Ok(reports)
     }
 }

@@ -6,9 +6,10 @@ mod density;
 mod keyframe;
 mod ledger;
 mod mapper;
+mod schedule;
 mod seeding;
 
-pub use config::{MappingConfig, SeedingConfig, WindowConfig};
+pub use config::{MappingConfig, SeedingConfig, SkipConfig, WindowConfig};
 pub use density::{ClassicConfig, DensityConfig, DensityStrategy, VcdConfig};
 pub use keyframe::{Keyframe, KeyframeId};
 pub use mapper::{KeyframeReport, Mapper, MappingError};

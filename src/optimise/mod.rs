@@ -1,6 +1,7 @@
 //! Moving the map towards the keyframes: the image loss, its gradient, and Adam, all on the GPU.
 
 mod adam;
+mod image_buffers;
 mod loss;
 mod optimiser;
 mod scores;

@@ -4,20 +4,13 @@ use std::time::{Duration, Instant};
 
 use bytemuck::{Pod, Zeroable};
 
+use super::image_buffers::{self, ImageBuffers, LOSS_TILE};
 use super::scores::{GaussianScore, Scores, WrongPixels};
 use super::{AdamConfig, LossConfig, LossTerms, TargetImage};
 use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, workgroups};
 use crate::render::layout::{AdamSetup, COUNTERS, Counter, LossSetup, VISIBLE_COUNTER, View};
 use crate::render::{BlendForm, GpuCloud, PreparedView, Rasterizer, ViewCounts, cloud_from_planes, shaders};
 use crate::splat::{GaussianCloud, ViewCamera};
-
-const LOSS_TILE: u32 = 16;
-const LOSS_RADIUS: u32 = 5;
-
-/// Twin of the shaders' function: pixels along a side of a plane with a border of zeros.
-fn bordered(size: u32) -> u32 {
-    size.next_multiple_of(LOSS_TILE) + 2 * LOSS_RADIUS
-}
 
 /// What a step did.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -88,12 +81,9 @@ pub struct Optimiser {
     encode_time: Duration,
     adam: GpuBuffer,
     loss_setup: GpuBuffer,
-    /// Width and height that the buffers per pixel are for.
-    size: (u32, u32),
+    /// Of each size of view, the present one first.
+    images: Vec<ImageBuffers>,
     gaussians: usize,
-    partials: GpuBuffer,
-    image_gradients: GpuBuffer,
-    loss_sums: GpuBuffer,
     loss_total: GpuBuffer,
     pose_sums: GpuBuffer,
     pose_gradient: GpuBuffer,
@@ -128,11 +118,8 @@ impl Optimiser {
             encode_time: Duration::ZERO,
             adam: GpuBuffer::uniform(gpu, "Adam", &AdamSetup::zeroed())?,
             loss_setup: GpuBuffer::uniform(gpu, "loss setup", &LossSetup::zeroed())?,
-            size: (0, 0),
+            images: Vec::new(),
             gaussians: 0,
-            partials: empty("loss partials")?,
-            image_gradients: empty("image gradients")?,
-            loss_sums: empty("loss sums")?,
             loss_total: GpuBuffer::computed_uniform(gpu, "loss", 16)?,
             pose_sums: empty("pose sums")?,
             pose_gradient: GpuBuffer::storage(gpu, "pose gradient", 32)?,
@@ -235,9 +222,9 @@ impl Optimiser {
     ) -> Result<Gradients, GpuError> {
         let gpu = rasterizer.gpu().clone();
         self.reserve(&gpu, &View::new(camera, background), cloud)?;
-        self.image_gradients.write(&gpu, 0, by_color_depth);
+        self.images[0].gradients.write(&gpu, 0, by_color_depth);
         let alpha: Vec<[f32; 4]> = by_alpha.iter().map(|a| [*a, 0.0, 0.0, 0.0]).collect();
-        self.image_gradients.write(&gpu, by_color_depth.len(), &alpha);
+        self.images[0].gradients.write(&gpu, by_color_depth.len(), &alpha);
         self.collect(rasterizer, cloud, camera, background, &Objective::Given)
     }
 
@@ -301,7 +288,7 @@ impl Optimiser {
         rasterizer.encode_forward(&mut pass, cloud, &prepared);
         if let Objective::Image(target, loss, scored) = objective {
             self.encode_loss(&mut pass, rasterizer, target, loss);
-            let image = (&self.image_gradients, &self.loss_total);
+            let image = (&self.images[0].gradients, &self.loss_total);
             scored.iter().for_each(|wrong| self.scores.encode(&mut pass, rasterizer, &prepared, image, (wrong, loss)));
         }
         self.encode_backward(&mut pass, rasterizer, cloud, &prepared, sink);
@@ -322,12 +309,12 @@ impl Optimiser {
             (2, &ws.state),
             (3, &target.color),
             (4, &target.depth),
-            (5, &self.partials),
+            (5, &self.images[0].partials),
         ];
         let with = |last| inputs.iter().copied().chain([last]).collect::<Vec<_>>();
-        k.loss_forward.dispatch(gpu, pass, &with((6, &self.loss_sums)), forward);
-        k.loss_reduce.dispatch(gpu, pass, &[(0, &self.loss_sums), (1, &self.loss_total)], [1, 1, 1]);
-        k.loss_backward.dispatch(gpu, pass, &with((6, &self.image_gradients)), backward);
+        k.loss_forward.dispatch(gpu, pass, &with((6, &self.images[0].loss_sums)), forward);
+        k.loss_reduce.dispatch(gpu, pass, &[(0, &self.images[0].loss_sums), (1, &self.loss_total)], [1, 1, 1]);
+        k.loss_backward.dispatch(gpu, pass, &with((6, &self.images[0].gradients)), backward);
     }
 
     fn encode_backward(
@@ -347,7 +334,7 @@ impl Optimiser {
             (4, &ws.projected),
             (5, &ws.color_depth),
             (6, &ws.state),
-            (7, &self.image_gradients),
+            (7, &self.images[0].gradients),
             (8, &ws.pair_gradients),
         ];
         k.rasterize_backward.dispatch(gpu, pass, &blend, workgroups(prepared.view.tiles()));
@@ -382,16 +369,7 @@ impl Optimiser {
     }
 
     fn reserve(&mut self, gpu: &Gpu, view: &View, cloud: &GpuCloud) -> Result<(), GpuError> {
-        if (view.width, view.height) != self.size {
-            let pixels = u64::from(view.pixels());
-            let blocks = u64::from(view.width.div_ceil(LOSS_TILE) * view.height.div_ceil(LOSS_TILE / 2));
-            let bordered = u64::from(bordered(view.width)) * u64::from(bordered(view.height));
-            self.partials = GpuBuffer::storage(gpu, "loss partials", bordered * 48)?;
-            self.image_gradients = GpuBuffer::storage(gpu, "image gradients", pixels * 32)?;
-            // Its length is the number of terms that are summed.
-            self.loss_sums = GpuBuffer::storage(gpu, "loss sums", blocks * 16)?;
-            self.size = (view.width, view.height);
-        }
+        image_buffers::choose(&mut self.images, gpu, (view.width, view.height))?;
         if cloud.capacity() > self.gaussians {
             self.pose_sums = GpuBuffer::storage(gpu, "pose sums", (cloud.capacity() as u64).div_ceil(256) * 32)?;
             self.gaussians = cloud.capacity();

@@ -1,0 +1,102 @@
+//! Which keyframe each step learns from, at which size, and when further steps gain nothing.
+
+use std::collections::BTreeMap;
+
+use fastrand::Rng;
+
+use super::keyframe::MappedKeyframe;
+use super::{SkipConfig, WindowConfig};
+
+/// Views that a batch must have seen before in the same session until its gain says anything.
+const MIN_REPEATED: usize = 4;
+
+/// The newest keyframes and the older ones that share most landmarks with the newest, newest first; indices.
+pub(super) fn window(keyframes: &[MappedKeyframe], config: &WindowConfig) -> Vec<usize> {
+    let len = keyframes.len();
+    let recent = len.saturating_sub(config.recent);
+    let mut window: Vec<usize> = (recent..len).rev().collect();
+    let covisible = &keyframes[len - 1].covisible;
+    let older = covisible.iter().filter_map(|id| keyframes[..recent].binary_search_by_key(id, |k| k.id).ok());
+    window.extend(older.take(config.covisible));
+    window
+}
+
+/// The steps after one keyframe.
+#[derive(Debug)]
+pub(super) struct Session {
+    window: Vec<usize>,
+    steps: usize,
+    taken: usize,
+    /// The loss of each view at its last step of this session.
+    losses: BTreeMap<usize, f32>,
+}
+
+/// What one step learns from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Step {
+    pub keyframe: usize,
+    /// At half the size.
+    pub coarse: bool,
+}
+
+impl Session {
+    pub fn new(window: Vec<usize>, steps: usize) -> Self {
+        Self { window, steps, taken: 0, losses: BTreeMap::new() }
+    }
+
+    /// The next steps, at most `count`: the window in turn, newest first, and now and then any other keyframe, so that the map does not
+    /// forget.
+    pub fn next(
+        &mut self,
+        count: usize,
+        keyframes: &[MappedKeyframe],
+        rng: &mut Rng,
+        (config, skip): (&WindowConfig, &SkipConfig),
+    ) -> Vec<Step> {
+        let count = count.min(self.steps - self.taken);
+        let draw = |taken: usize| {
+            let keyframe = if keyframes.len() > self.window.len() && rng.f32() < config.older_share {
+                draw_older(keyframes, config.recent, rng, skip.draw_by_loss)
+            } else {
+                self.window[taken % self.window.len()]
+            };
+            Step { keyframe, coarse: (taken as f32) < skip.coarse_share * self.steps as f32 }
+        };
+        let steps = (self.taken..self.taken + count).map(draw).collect();
+        self.taken += count;
+        steps
+    }
+
+    /// Takes note of a batch's losses; says whether more steps are worth their time.
+    pub fn goes_on(&mut self, batch: &[Step], losses: &[f32], min_gain: f32) -> bool {
+        let (mut repeated, mut before, mut after) = (0, 0.0, 0.0);
+        for (step, &loss) in batch.iter().zip(losses) {
+            // Losses at different sizes don't compare.
+            let view = 2 * step.keyframe + usize::from(step.coarse);
+            if let Some(last) = self.losses.insert(view, loss) {
+                repeated += 1;
+                before += last;
+                after += loss;
+            }
+        }
+        let converged = repeated >= MIN_REPEATED && before - after < min_gain * before;
+        self.taken < self.steps && !(min_gain > 0.0 && converged)
+    }
+}
+
+/// Any keyframe before the newest ones; those with more loss more often, if so wished.
+fn draw_older(keyframes: &[MappedKeyframe], recent: usize, rng: &mut Rng, by_loss: bool) -> usize {
+    let older = &keyframes[..keyframes.len() - recent.min(keyframes.len() - 1)];
+    if !by_loss {
+        return rng.usize(..older.len());
+    }
+    let total: f32 = older.iter().map(|k| k.loss).sum();
+    let mut left = rng.f32() * total;
+    for (index, keyframe) in older.iter().enumerate() {
+        left -= keyframe.loss;
+        if left < 0.0 {
+            return index;
+        }
+    }
+    older.len() - 1
+}

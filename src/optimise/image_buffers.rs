@@ -1,0 +1,46 @@
+//! Buffers of the image loss, for each size of view in turn.
+
+use crate::gpu::{Gpu, GpuBuffer, GpuError};
+
+/// Pixels along a side of what one workgroup of the loss shaders covers.
+pub(super) const LOSS_TILE: u32 = 16;
+const LOSS_RADIUS: u32 = 5;
+
+/// Twin of the shaders' function: pixels along a side of a plane with a border of zeros.
+fn bordered(size: u32) -> u32 {
+    size.next_multiple_of(LOSS_TILE) + 2 * LOSS_RADIUS
+}
+
+/// Sizes of view that the optimiser keeps buffers for: whole and half.
+const SIZES_KEPT: usize = 2;
+
+/// What the loss needs of a view's size. The partials' borders stay zero, so another size cannot share them.
+#[derive(Debug)]
+pub(super) struct ImageBuffers {
+    size: (u32, u32),
+    pub partials: GpuBuffer,
+    pub gradients: GpuBuffer,
+    /// Its length is the number of terms that are summed.
+    pub loss_sums: GpuBuffer,
+}
+
+impl ImageBuffers {
+    fn new(gpu: &Gpu, (width, height): (u32, u32)) -> Result<Self, GpuError> {
+        let blocks = u64::from(width.div_ceil(LOSS_TILE) * height.div_ceil(LOSS_TILE / 2));
+        Ok(Self {
+            size: (width, height),
+            partials: GpuBuffer::storage(gpu, "loss partials", u64::from(bordered(width)) * u64::from(bordered(height)) * 48)?,
+            gradients: GpuBuffer::storage(gpu, "image gradients", u64::from(width * height) * 32)?,
+            loss_sums: GpuBuffer::storage(gpu, "loss sums", blocks * 16)?,
+        })
+    }
+}
+
+/// Puts the buffers for `size` in front, made anew if they are not among the last few.
+pub(super) fn choose(kept: &mut Vec<ImageBuffers>, gpu: &Gpu, size: (u32, u32)) -> Result<(), GpuError> {
+    let place = kept.iter().position(|images| images.size == size);
+    let images = place.map_or_else(|| ImageBuffers::new(gpu, size), |place| Ok(kept.remove(place)))?;
+    kept.insert(0, images);
+    kept.truncate(SIZES_KEPT);
+    Ok(())
+}
