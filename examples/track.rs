@@ -36,8 +36,15 @@ fn main() -> Result<(), Box<dyn Error>> {
             lost.push(index);
         }
     }
+    tracker.finish()?;
     let trajectory = Trajectory { poses: tracker.trajectory().into_iter().map(|(_, pose)| pose).collect() };
-    println!("tracked {}/{}, {} keyframes", trajectory.poses.len(), times.len(), tracker.keyframes().len());
+    println!(
+        "tracked {}/{}, {} keyframes, {} live",
+        trajectory.poses.len(),
+        times.len(),
+        tracker.keyframes().len(),
+        tracker.living_keyframes()
+    );
     if !lost.is_empty() {
         println!("lost: {lost:?}");
     }
