@@ -60,7 +60,10 @@ fn render(index: usize, world_from_camera: &Se3) -> Frame {
 
 /// A smooth walk through the room.
 fn truth(index: usize) -> Se3 {
-    let t = index as f64;
+    walk(index as f64)
+}
+
+fn walk(t: f64) -> Se3 {
     se3::exp(&Vector6::new(0.03 * t, 0.01 * (t * 0.7).sin(), 0.015 * t, 0.01 * (t * 0.5).sin(), 0.02 * t, 0.005 * t))
 }
 
@@ -152,6 +155,25 @@ fn paced_tracking_takes_adjustments_in_when_they_are_ready() {
     }
     assert!(!answers.1.is_empty() || answers.0.iter().any(|t| !t.updates.is_empty()));
     assert_told(&tracker, &answers);
+}
+
+#[test]
+fn keyframes_close_together_are_culled_and_keep_their_poses() {
+    let slow = |i: usize| walk(0.2 * i as f64);
+    let frames: Vec<Frame> = (0..40).map(|i| render(i, &slow(i))).collect();
+    let run = |keyframe_culling: bool| {
+        // A keyframe wherever the camera has moved at all.
+        let config = TrackingConfig { keyframe_translation: 0.002, keyframe_rotation_rad: 0.002, keyframe_culling, ..config() };
+        let (tracker, answers) = run(Tracker::new(CAMERA, Sensor::Rgbd, &config).unwrap(), &frames);
+        for (index, pose) in tracker.trajectory() {
+            let off = (slow(0).inverse() * slow(index)).inverse() * pose.world_from_camera;
+            assert!(off.translation.vector.norm() < 0.006 && off.rotation.angle() < 0.004, "frame {index}: {off}");
+        }
+        assert_told(&tracker, &answers);
+        (tracker.keyframes().len(), tracker.living_keyframes())
+    };
+    let (all, culled) = (run(false), run(true));
+    assert!(all.0 == all.1 && all.0 > 25 && culled.1 + 5 <= culled.0, "{all:?}, {culled:?}");
 }
 
 #[test]

@@ -14,6 +14,8 @@ use super::relative_pose::pass_on;
 /// Share of a keyframe's landmarks that must be seen elsewhere, and by how many other keyframes.
 const REDUNDANT_SHARE: f64 = 0.9;
 const OTHERS: usize = 3;
+/// Pyramid levels by which they may see them coarser: as much as a corner is found on one level or the next by chance.
+const COARSER: u8 = 1;
 /// The newest keyframes stay: what they see is still growing.
 const KEPT_NEWEST: usize = 5;
 
@@ -31,14 +33,14 @@ pub fn cull_around(map: &mut Map, around: usize, keep: impl Fn(usize) -> bool, c
     culled
 }
 
-/// Whether others see nearly all of what a keyframe sees, as finely as it does.
+/// Whether others see nearly all of what a keyframe sees, about as finely as it does.
 fn is_redundant(map: &Map, keyframe: usize) -> bool {
     let octave = |s: &Sighting| map.keyframes[s.keyframe].features.features[s.feature].octave;
     let (mut seen, mut elsewhere) = (0, 0);
     for (feature, landmark) in map.keyframes[keyframe].landmarks.iter().enumerate() {
         let Some(landmark) = landmark else { continue };
         let own = octave(&Sighting { keyframe, feature });
-        let finer = |s: &&Sighting| s.keyframe != keyframe && octave(s) <= own;
+        let finer = |s: &&Sighting| s.keyframe != keyframe && octave(s) <= own + COARSER;
         seen += 1;
         elsewhere += usize::from(map.landmarks[*landmark].sightings.iter().filter(finer).count() >= OTHERS);
     }
@@ -126,7 +128,8 @@ mod tests {
     fn what_others_see_is_given_up_and_what_only_one_sees_stays() {
         assert_eq!(cull_all(&mut map(4, 2), 2), [1, 3, 4, 5, 6]);
         assert_eq!(cull_all(&mut map(5, 2), 2), [1, 4, 5, 6], "5 of 45 landmarks are its own");
-        assert_eq!(cull_all(&mut map(0, 1), 2), [1, 4, 5, 6], "it sees them finer than the others");
+        assert_eq!(cull_all(&mut map(0, 1), 2), [1, 3, 4, 5, 6]);
+        assert_eq!(cull_all(&mut map(0, 0), 2), [1, 4, 5, 6], "it sees them finer than the others");
     }
 
     #[test]

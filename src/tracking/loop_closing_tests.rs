@@ -50,7 +50,7 @@ fn view(k: usize, wall: &[(Point3<f64>, Descriptor)], with_depth: bool) -> (Vec<
 
 /// The walk as a tracker with a drift of `step` from keyframe to keyframe would have mapped it: landmarks lie where the keyframe that
 /// first saw them put them, and are forgotten after a few keyframes.
-fn drifted(step: &Sim3, with_depth: bool, config: &TrackingConfig) -> Map {
+pub(super) fn drifted(step: &Sim3, with_depth: bool, config: &TrackingConfig) -> Map {
     let wall = wall();
     let mut map = Map::default();
     let mut known: Vec<Option<(usize, usize)>> = vec![None; wall.len()];

@@ -3,8 +3,9 @@
 //!
 //! One frame: features, with depth where the sensor gives it → the pose predicted from the last motion → last frame's points → the local
 //! map; all pixels where features are too few (RGB-D). Now and then a keyframe: landmarks from depth and by triangulation, joined with
-//! what its neighbours see → local bundle adjustment in a thread beside → loop closing. Only the caller's thread changes the map, and
-//! unpaced it does so in one fixed order: the same frames give the same bits. Knows nothing of the mapper or the GPU.
+//! what its neighbours see → local bundle adjustment in a thread beside → loop closing → culling of what became redundant. Only the
+//! caller's thread changes the map, and unpaced it does so in one fixed order: the same frames give the same bits. Knows nothing of the
+//! mapper or the GPU.
 
 mod bundle;
 mod config;
@@ -78,6 +79,7 @@ pub struct TrackedFrame {
 pub struct NewKeyframe {
     /// Counts from 0 in the order of creation.
     pub id: usize,
+    /// Before its bundle adjustment, whose result follows as an update.
     pub world_from_camera: Se3,
     /// Where it sees landmarks, and how far along z: pixels of the distortion-free pinhole, metres. For the mapper of a camera without a
     /// depth image; empty where frames have one.

@@ -15,8 +15,8 @@ use crate::geometry::{Pinhole, Se3};
 const MIN_SHARED: usize = 15;
 /// Keyframes that hold the window in place, at most; bounds the time.
 const MAX_FIXED: usize = 40;
-/// Keyframes that one adjustment may move: a bound on its time.
-const MAX_ADJUSTED: usize = 100;
+/// Keyframes that one adjustment may move: a bound on its time, which is then some seconds, and on its memory.
+const MAX_ADJUSTED: usize = 1000;
 
 /// A part of the map to be adjusted: the problem, and what its numbers mean.
 #[derive(Clone, Debug, Default)]
@@ -173,4 +173,41 @@ fn make_problem(
         }
     }
     (problem, sightings)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::loop_closing_tests::drifted;
+    use super::super::map::Keyframe;
+    use super::*;
+    use crate::geometry::{Sim3, se3};
+    use nalgebra::{Point3, Vector6};
+
+    #[test]
+    fn a_result_is_taken_into_a_map_that_has_gone_on() {
+        let config = TrackingConfig::default();
+        let mut map = drifted(&Sim3::identity(), true, &config);
+        let last = map.keyframes.len() - 1;
+        let mut window = Adjustment::of_window(&map, last, &config).unwrap();
+        let gone = window.landmarks[3];
+        map.remove_landmark(gone);
+        window.problem.observations.iter_mut().filter(|o| o.point == 3).for_each(|o| o.trust = Trust::Outlier);
+        // A newer keyframe sees what the last one saw, and one landmark of its own.
+        let newer = map.keyframes.len();
+        let seen = map.keyframes[last].landmarks.clone();
+        map.keyframes.push(Keyframe { landmarks: vec![None; seen.len()], ..map.keyframes[last].clone() });
+        for (feature, landmark) in seen.into_iter().enumerate().skip(1) {
+            landmark.into_iter().for_each(|l| map.add_sighting(l, Sighting { keyframe: newer, feature }));
+        }
+        let own = map.add_landmark(Sighting { keyframe: newer, feature: 0 }, Point3::new(1.0, 2.0, 3.0), &config);
+        let pose = map.keyframes[newer].camera_from_world;
+        // As if all that is free had been moved alike.
+        let push = se3::exp(&Vector6::new(0.02, -0.01, 0.03, 0.01, 0.02, -0.02));
+        window.problem.poses.iter_mut().for_each(|p| *p *= push);
+        let moved = window.apply(&mut map, &config);
+        assert!(moved.contains(&last) && moved.contains(&newer) && !moved.contains(&0) && moved.is_sorted());
+        assert!(se3::log(&(map.keyframes[newer].camera_from_world * (pose * push).inverse())).norm() < 1e-12);
+        assert!((map.landmarks[own].position - push.inverse() * Point3::new(1.0, 2.0, 3.0)).norm() < 1e-12);
+        assert!(map.landmarks[gone].fate == Fate::Removed && map.landmarks[gone].sightings.is_empty());
+    }
 }

@@ -13,9 +13,11 @@ use super::super::worker::Worker;
 use super::super::{PoseMeasurement, StageTimes, TrackingError, relative_pose};
 use super::{Tracker, milliseconds};
 use crate::geometry::Se3;
+use crate::sequence::Sensor;
 
 /// Unpaced: frames after its keyframe at which an adjustment is taken in, at most, and as a share of those since the keyframe before:
-/// where keyframes follow each other closely the map must not lag behind.
+/// where keyframes follow each other closely the map must not lag behind. Points that were only triangulated are poor until they are
+/// adjusted: without depth it is always the next frame.
 const TAKEN_IN_AFTER: usize = 3;
 const TAKEN_IN_SHARE: usize = 4;
 
@@ -143,7 +145,8 @@ impl Tracker {
 
     fn begin(&mut self, adjustment: Adjustment, around: Option<usize>) -> Result<(), TrackingError> {
         self.adjusting.worker.give(adjustment)?;
-        let later = (self.adjusting.interval / TAKEN_IN_SHARE).clamp(1, TAKEN_IN_AFTER);
+        let most = if self.sensor == Sensor::Mono { 1 } else { TAKEN_IN_AFTER };
+        let later = (self.adjusting.interval / TAKEN_IN_SHARE).clamp(1, most);
         self.adjusting.under_way = Some(UnderWay { around, due: self.frames_seen + later });
         Ok(())
     }
