@@ -8,6 +8,7 @@ use nalgebra::{Matrix3, Matrix6, Matrix6x3, Point3, Vector3, Vector6};
 use super::measurement::{Measurement, Trust, point_by_pose};
 use super::pose_graph::{Edge, Linearised};
 use super::reduced::ReducedSystem;
+use super::relative_pose::is_believed;
 use crate::geometry::sim3::Matrix7;
 use crate::geometry::{Pinhole, Se3, Sim3, se3};
 
@@ -15,9 +16,6 @@ use crate::geometry::{Pinhole, Se3, Sim3, se3};
 const MAX_LAMBDA: f64 = 1e6;
 /// A step that lowers the cost by less than this share has converged.
 const CONVERGED_SHARE: f64 = 1e-4;
-
-/// A relative pose that is still further off than this, in standard deviations, when everything has settled is not believed.
-const BELIEF: f64 = 6.0;
 
 /// One measurement of a point by a camera.
 #[derive(Clone, Copy, Debug)]
@@ -101,13 +99,13 @@ impl BundleProblem {
         (initial, cost)
     }
 
-    /// Judges every observation anew by χ².
+    /// Judges every observation anew by χ², and relative poses by how far they are off.
     pub fn judge(&mut self, pinhole: &Pinhole) {
         for o in &mut self.observations {
             o.trust = o.measurement.judge(pinhole, &(self.poses[o.pose] * self.points[o.point]).coords);
         }
-        for index in 0..self.relative.len() {
-            self.relative[index].believed = self.off(&self.relative[index].edge) <= BELIEF * BELIEF;
+        for r in &mut self.relative {
+            r.believed = is_believed(&r.edge, &self.poses[r.edge.a], &self.poses[r.edge.b]);
         }
     }
 

@@ -7,6 +7,7 @@ use super::loop_closing::{CONNECTED_SHARED, Moved, Recognised};
 use super::map::{Fate, Map, Sighting};
 use super::mapping::join;
 use super::pose_graph::{Edge, PoseGraph};
+use super::relative_pose::is_believed;
 use crate::geometry::sim3::Vector7;
 use crate::geometry::{Pinhole, Se3, Sim3};
 
@@ -40,7 +41,8 @@ pub fn correct(
     graph.edges = skeleton(map, depth);
     edges.push(Edge { doubt: Some(DOUBT), ..edge(found.keyframe, found.place, keyframe_from_place, found.matches.len(), depth) });
     graph.edges.extend(edges.iter());
-    graph.edges.extend(map.measured.values().map(|m| m.edge(m.keyframe, m.relative_to)));
+    let measured = map.measured.values().map(|m| m.edge(m.keyframe, m.relative_to));
+    graph.edges.extend(measured.filter(|e| is_believed(e, &before[e.a], &before[e.b])));
     graph.optimise(GRAPH_STEPS);
     move_map(map, &before, &graph.poses, config);
     let living: Vec<usize> = (0..before.len()).map(|k| map.living(k)).collect();

@@ -1,8 +1,8 @@
 //! What someone else measured of two keyframes' relative pose, with its noise: kept with the map, newest per pair, and used beside the
 //! landmarks by bundle adjustment and, beside the loops, by the pose graph.
 //!
-//! A measurement may improve a pose and never tear the map: errors far beyond its noise pull less and less (Huber), and bundle
-//! adjustment leaves out those that the landmarks contradict altogether.
+//! A measurement may improve a pose and never tear the map: errors far beyond its noise pull less and less (Huber), and what contradicts
+//! the landmarks altogether is left out.
 
 use std::f64::consts::PI;
 
@@ -18,6 +18,8 @@ const MAX_SIGMA_METRES: f64 = 10.0;
 const MAX_METRES: f64 = 1e4;
 /// Errors beyond this many standard deviations pull less and less.
 const DOUBT: f64 = 3.0;
+/// Errors that are still beyond this many where the landmarks have settled are not believed.
+const BELIEF: f64 = 6.0;
 
 /// A measured pose of one keyframe in the frame of another.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -77,6 +79,11 @@ impl PoseMeasurement {
         }
         (self.keyframe != self.relative_to).then_some(self)
     }
+}
+
+/// Whether the factor agrees with poses that have settled.
+pub fn is_believed(factor: &Edge, a_from_world: &Se3, b_from_world: &Se3) -> bool {
+    factor.residual(&Sim3::from(*a_from_world), &Sim3::from(*b_from_world)).norm() <= BELIEF
 }
 
 /// Keeps a measurement; it takes the place of an earlier one of the same pair.
