@@ -5,7 +5,7 @@ use std::path::Path;
 use image::{Rgb, RgbImage};
 use keysplat::geometry::{Camera, Distortion, Pinhole, Se3, StampedPose, se3};
 use keysplat::sequence::{DepthImage, Frame, Sensor, Sequence};
-use keysplat::tracking::{TrackedFrame, Tracker, TrackingConfig, TrackingState};
+use keysplat::tracking::{PoseMeasurement, TrackedFrame, Tracker, TrackingConfig, TrackingState};
 use nalgebra::{Point3, Vector2, Vector3, Vector6};
 
 const CAMERA: Camera = Camera {
@@ -60,7 +60,10 @@ fn render(index: usize, world_from_camera: &Se3) -> Frame {
 
 /// A smooth walk through the room.
 fn truth(index: usize) -> Se3 {
-    let t = index as f64;
+    walk(index as f64)
+}
+
+fn walk(t: f64) -> Se3 {
     se3::exp(&Vector6::new(0.03 * t, 0.01 * (t * 0.7).sin(), 0.015 * t, 0.01 * (t * 0.5).sin(), 0.02 * t, 0.005 * t))
 }
 
@@ -92,25 +95,38 @@ fn assert_within(estimate: &Se3, index: usize, max_metres: f64, max_angle_rad: f
     assert!(metres < max_metres && angle_rad < max_angle_rad, "frame {index} is off by {metres} m and {angle_rad} rad");
 }
 
-fn run(frames: &[Frame]) -> (Tracker, Vec<TrackedFrame>) {
-    let mut tracker = tracker();
+/// What was said of each frame, and the updates that came at the end.
+type Answers = (Vec<TrackedFrame>, Vec<(usize, Se3)>);
+
+fn run(mut tracker: Tracker, frames: &[Frame]) -> (Tracker, Answers) {
     let tracked = frames.iter().map(|f| tracker.track(f, f.index % 8 != 4).unwrap()).collect();
-    (tracker, tracked)
+    let last = tracker.finish().unwrap();
+    assert!(tracker.finish().unwrap().is_empty());
+    (tracker, (tracked, last))
+}
+
+/// What was handed out adds up to the keyframes' poses.
+fn assert_told(tracker: &Tracker, (tracked, last): &Answers) {
+    let mut told = Vec::new();
+    for t in tracked {
+        t.updates.iter().for_each(|(id, pose)| told[*id] = *pose);
+        told.extend(t.keyframe.as_ref().map(|k| k.world_from_camera));
+    }
+    last.iter().for_each(|(id, pose)| told[*id] = *pose);
+    assert_eq!(told, tracker.keyframes().iter().map(|k| k.world_from_camera).collect::<Vec<_>>());
 }
 
 #[test]
 fn a_walk_through_a_textured_room_is_recovered_the_same_each_time() {
     let frames: Vec<Frame> = (0..16).map(|i| render(i, &truth(i))).collect();
-    let (tracker, tracked) = run(&frames);
-    for (index, t) in tracked.iter().enumerate() {
+    let (tracker, answers) = run(tracker(), &frames);
+    for (index, t) in answers.0.iter().enumerate() {
         assert_eq!(t.state, TrackingState::Tracking);
         assert_close(&t.world_from_camera.unwrap(), index);
         assert!(t.keyframe.is_none() || index % 8 != 4, "frame {index} is held out");
         if let Some(keyframe) = &t.keyframe {
             assert!(keyframe.covisible.is_sorted_by(|a, b| a.1 >= b.1));
             assert!(t.updates.iter().all(|(id, _)| *id < keyframe.id));
-        } else {
-            assert!(t.updates.is_empty());
         }
     }
     let trajectory = tracker.trajectory();
@@ -118,17 +134,71 @@ fn a_walk_through_a_textured_room_is_recovered_the_same_each_time() {
     trajectory.iter().for_each(|(index, pose)| assert_close(&pose.world_from_camera, *index));
     let keyframes = tracker.keyframes();
     assert!((3..=12).contains(&keyframes.len()), "{} keyframes", keyframes.len());
-    // The updates that were handed out add up to the keyframes' poses.
-    let mut handed_out = Vec::new();
-    for t in &tracked {
-        handed_out.extend(t.keyframe.as_ref().map(|k| k.world_from_camera));
-        t.updates.iter().for_each(|(id, pose)| handed_out[*id] = *pose);
-    }
-    assert_eq!(handed_out, keyframes.iter().map(|k| k.world_from_camera).collect::<Vec<_>>());
+    assert!(answers.0.iter().any(|t| !t.updates.is_empty()));
+    assert_told(&tracker, &answers);
 
-    let (again, _) = run(&frames);
+    let (again, same) = run(self::tracker(), &frames);
+    assert_eq!(same.1, answers.1);
+    for (a, b) in same.0.iter().zip(&answers.0) {
+        assert_eq!((a.world_from_camera, &a.keyframe, &a.updates), (b.world_from_camera, &b.keyframe, &b.updates));
+    }
     assert_eq!(again.trajectory(), trajectory);
     assert_eq!(again.keyframes(), keyframes);
+}
+
+#[test]
+fn paced_tracking_takes_adjustments_in_when_they_are_ready() {
+    let frames: Vec<Frame> = (0..16).map(|i| render(i, &truth(i))).collect();
+    let (tracker, answers) = run(tracker().paced(true), &frames);
+    for (index, pose) in tracker.trajectory() {
+        assert_close(&pose.world_from_camera, index);
+    }
+    assert!(!answers.1.is_empty() || answers.0.iter().any(|t| !t.updates.is_empty()));
+    assert_told(&tracker, &answers);
+}
+
+#[test]
+fn keyframes_close_together_are_culled_and_keep_their_poses() {
+    let slow = |i: usize| walk(0.2 * i as f64);
+    let frames: Vec<Frame> = (0..40).map(|i| render(i, &slow(i))).collect();
+    let run = |keyframe_culling: bool| {
+        // A keyframe wherever the camera has moved at all.
+        let config = TrackingConfig { keyframe_translation: 0.002, keyframe_rotation_rad: 0.002, keyframe_culling, ..config() };
+        let (tracker, answers) = run(Tracker::new(CAMERA, Sensor::Rgbd, &config).unwrap(), &frames);
+        for (index, pose) in tracker.trajectory() {
+            let off = (slow(0).inverse() * slow(index)).inverse() * pose.world_from_camera;
+            assert!(off.translation.vector.norm() < 0.006 && off.rotation.angle() < 0.004, "frame {index}: {off}");
+        }
+        assert_told(&tracker, &answers);
+        (tracker.keyframes().len(), tracker.living_keyframes())
+    };
+    let (all, culled) = (run(false), run(true));
+    assert!(all.0 == all.1 && all.0 > 25 && culled.1 + 5 <= culled.0, "{all:?}, {culled:?}");
+}
+
+#[test]
+fn false_pose_measurements_do_no_harm_and_nonsense_is_refused() {
+    let mut tracker = tracker();
+    for index in 0..16 {
+        tracker.track(&render(index, &truth(index)), true).unwrap();
+        let newest = tracker.keyframes().len() - 1;
+        let wrong = |keyframe_from_relative| PoseMeasurement {
+            keyframe: newest,
+            relative_to: 0,
+            keyframe_from_relative,
+            sigma_translation_metres: 0.001,
+            sigma_rotation_rad: 0.001,
+        };
+        if newest > 0 {
+            tracker.measure(&[wrong(Se3::translation(0.5, 0.0, index as f64))]).unwrap();
+        }
+        let nan = [wrong(Se3::translation(0.0, f64::NAN, 0.0))];
+        assert!(tracker.measure(&nan).unwrap_err().to_string().contains("refused"));
+    }
+    tracker.finish().unwrap();
+    for (index, pose) in tracker.trajectory() {
+        assert_close(&pose.world_from_camera, index);
+    }
 }
 
 #[test]
@@ -137,6 +207,7 @@ fn blind_frames_are_lost_and_the_camera_is_found_again() {
     for i in 0..6 {
         tracker.track(&render(i, &truth(i)), true).unwrap();
     }
+    tracker.finish().unwrap();
     let keyframes = tracker.keyframes();
     for (i, grey) in [(6, 0), (7, 255), (8, 90)] {
         let mut blind = render(i, &truth(i));
@@ -175,6 +246,7 @@ fn a_closed_loop_takes_the_drift_out() {
             assert_eq!(tracked.state, TrackingState::Tracking, "frame {i}");
             moved += tracked.updates.len();
         }
+        moved += tracker.finish().unwrap().len();
         // The circle is also too wide; that is no drift, and stays.
         let off =
             |(i, pose): &(usize, StampedPose)| (turn(0).inverse() * turn(*i)).rotation.angle_to(&pose.world_from_camera.rotation);

@@ -68,7 +68,7 @@ pub(super) fn track(
 ) -> TrackSummary {
     let mut summary = TrackSummary::default();
     let mut tracker = match Tracker::new(sequence.camera, sequence.sensor, &config.tracking) {
-        Ok(tracker) => tracker,
+        Ok(tracker) => tracker.paced(config.replay.paced),
         Err(error) => return TrackSummary { error: Some(error.into()), ..summary },
     };
     let rectifier = Rectifier::new(&sequence.camera, config.map_scale);
@@ -89,6 +89,10 @@ pub(super) fn track(
         if !sender.retry() || !hand_on(&mut sender, &rectifier, &frame, tracked) {
             break;
         }
+    }
+    // What is still under way; its updates are part of the last word.
+    if let Err(error) = guarded("tracking", || Ok(tracker.finish()?)) {
+        summary.error.get_or_insert(error);
     }
     if let Some(message) = sender.waiting.take() {
         // The last keyframe has no newer one to give way to.

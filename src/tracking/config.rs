@@ -46,6 +46,8 @@ pub struct TrackingConfig {
     pub window_keyframes: usize,
     /// Levenberg-Marquardt steps in each of the two rounds of one bundle adjustment. 0 turns it off.
     pub bundle_iterations: usize,
+    /// Whether keyframes that show nothing of their own are given up.
+    pub keyframe_culling: bool,
     /// Whether drift is taken out where a known place is seen again.
     pub loop_closing: bool,
 }
@@ -72,6 +74,7 @@ impl Default for TrackingConfig {
             keyframe_rotation_rad: 0.12,
             window_keyframes: 24,
             bundle_iterations: 5,
+            keyframe_culling: true,
             loop_closing: true,
         }
     }

@@ -12,6 +12,12 @@ pub enum TrackingError {
     FirstFrameWithoutDepth { frame: usize },
     #[error("frame {frame}: its {what} image is {found_width}x{found_height}, but the camera is {width}x{height}")]
     Size { frame: usize, what: &'static str, width: u32, height: u32, found_width: u32, found_height: u32 },
+    #[error("the pose of keyframe {keyframe} relative to {relative_to} is refused: {problem}")]
+    Measurement { keyframe: usize, relative_to: usize, problem: String },
+    #[error("the thread for bundle adjustment could not be started: {0}")]
+    Spawn(#[source] std::io::Error),
+    #[error("the thread for bundle adjustment panicked; what was tracked until then is kept. Please report this")]
+    Adjusting,
     #[error("OpenCV failed while extracting features: {0}")]
     OpenCv(#[from] opencv::Error),
 }

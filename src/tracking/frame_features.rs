@@ -31,7 +31,7 @@ pub struct Feature {
 }
 
 /// All features of a frame.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub struct FrameFeatures {
     pub features: Vec<Feature>,
     columns: usize,

@@ -71,7 +71,7 @@ pub struct LoopCloser {
 pub type Moved = (usize, f64);
 
 impl LoopCloser {
-    /// Closes a loop if `keyframe`, the newest, shows a place left long ago. Returns the keyframes that may have moved, in ascending
+    /// Closes a loop if `keyframe`, one of the newest, shows a place left long ago. Returns the keyframes that may have moved, in ascending
     /// order; none if there was no loop.
     pub fn close(&mut self, map: &mut Map, keyframe: usize, pinhole: &Pinhole, config: &TrackingConfig) -> Vec<Moved> {
         if self.last.is_some_and(|last| keyframe < last + REST) {
@@ -83,6 +83,13 @@ impl LoopCloser {
         let scale_is_free = search.scale_is_free;
         self.last = Some(keyframe);
         loop_correction::correct(map, &recognised, &mut self.edges, scale_is_free, pinhole, config)
+    }
+}
+
+impl LoopCloser {
+    /// Whether a loop begins or ends at a keyframe.
+    pub fn holds(&self, keyframe: usize) -> bool {
+        self.edges.iter().any(|e| e.a == keyframe || e.b == keyframe)
     }
 }
 

@@ -10,6 +10,8 @@ use super::frame_features::{Feature, FrameFeatures};
 use super::loop_closing::LoopCloser;
 use super::map::{Keyframe, Map, Sighting};
 use super::measurement::tests::PINHOLE;
+use super::relative_pose::{PoseMeasurement, keep};
+use super::window::Adjustment;
 use crate::geometry::sim3::{self, Vector7};
 use crate::geometry::{Se3, Sim3, align};
 
@@ -49,7 +51,7 @@ fn view(k: usize, wall: &[(Point3<f64>, Descriptor)], with_depth: bool) -> (Vec<
 
 /// The walk as a tracker with a drift of `step` from keyframe to keyframe would have mapped it: landmarks lie where the keyframe that
 /// first saw them put them, and are forgotten after a few keyframes.
-fn drifted(step: &Sim3, with_depth: bool, config: &TrackingConfig) -> Map {
+pub(super) fn drifted(step: &Sim3, with_depth: bool, config: &TrackingConfig) -> Map {
     let wall = wall();
     let mut map = Map::default();
     let mut known: Vec<Option<(usize, usize)>> = vec![None; wall.len()];
@@ -103,6 +105,9 @@ fn a_loop_is_closed_with_and_without_scale() {
         assert!(before > 0.1 && map.covisible(newest).iter().all(|(k, _)| *k > 20), "{before} m");
         let mut again = map.clone();
         let moved = LoopCloser::default().close(&mut map, newest, &PINHOLE, &config);
+        let mut all = Adjustment::of_all(&map, &config).unwrap();
+        all.solve(&PINHOLE, config.bundle_iterations);
+        all.apply(&mut map, &config);
         assert_eq!(moved.iter().map(|(k, _)| *k).collect::<Vec<_>>(), (1..=newest).collect::<Vec<_>>());
         assert!(moved.iter().all(|(_, growth)| if with_depth { *growth == 1.0 } else { (0.7..1.3).contains(growth) }));
         let after = off_metres(&map, !with_depth);
@@ -110,8 +115,37 @@ fn a_loop_is_closed_with_and_without_scale() {
         assert!(map.covisible(newest).iter().any(|(k, shared)| *k < 10 && *shared > 50), "both ends of the loop are joined");
 
         LoopCloser::default().close(&mut again, newest, &PINHOLE, &config);
+        all.apply(&mut again, &config);
         assert_eq!(again.keyframes[newest].camera_from_world, map.keyframes[newest].camera_from_world);
     }
+}
+
+#[test]
+fn measured_poses_hold_the_corrected_map_together_if_they_are_believed() {
+    let config = TrackingConfig::default();
+    let step = sim3::exp(&Vector7::from_column_slice(&[0.004, 0.001, -0.003, 0.001, 0.003, 0.0005, 0.0]));
+    let before = drifted(&step, true, &config);
+    let newest = before.keyframes.len() - 1;
+    let close = |off: Option<f64>| {
+        let mut map = before.clone();
+        let pose = |k: usize| before.keyframes[k].camera_from_world;
+        for (keyframe, off) in off.into_iter().flat_map(|off| (5..40).map(move |k| (k, off))) {
+            let relative_to = keyframe - 2;
+            let measurement = PoseMeasurement {
+                keyframe,
+                relative_to,
+                keyframe_from_relative: Se3::translation(off, 0.0, 0.0) * pose(keyframe) * pose(relative_to).inverse(),
+                sigma_translation_metres: 1e-3,
+                sigma_rotation_rad: 1e-3,
+            };
+            keep(&mut map, measurement);
+        }
+        assert!(!LoopCloser::default().close(&mut map, newest, &PINHOLE, &config).is_empty());
+        map.keyframes.iter().map(|k| k.camera_from_world).collect::<Vec<_>>()
+    };
+    let without = close(None);
+    assert_eq!(close(Some(0.5)), without, "half a metre off is not believed");
+    assert_ne!(close(Some(0.0)), without);
 }
 
 #[test]

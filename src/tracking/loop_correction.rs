@@ -1,13 +1,13 @@
 //! What a closed loop does to the map: the drift is spread over the keyframes by a pose graph, landmarks follow the keyframe that saw
-//! them first, what turned out to be the same is joined, and a bundle adjustment of all keyframes settles the rest where they are few
-//! enough (Mur-Artal, Montiel & Tardós, *ORB-SLAM*, 2015: the *essential graph*; its global adjustment).
+//! them first, and what turned out to be the same is joined (Mur-Artal, Montiel & Tardós, *ORB-SLAM*, 2015: the *essential graph*). The
+//! bundle adjustment of all keyframes that settles the rest is up to the caller.
 
 use super::TrackingConfig;
 use super::loop_closing::{CONNECTED_SHARED, Moved, Recognised};
 use super::map::{Fate, Map, Sighting};
 use super::mapping::join;
 use super::pose_graph::{Edge, PoseGraph};
-use super::window::adjust;
+use super::relative_pose::is_believed;
 use crate::geometry::sim3::Vector7;
 use crate::geometry::{Pinhole, Se3, Sim3};
 
@@ -24,8 +24,6 @@ const DOUBT: f64 = 10.0;
 const GRAPH_STEPS: usize = 30;
 /// Neighbours of the keyframe in which the place's landmarks are joined with theirs.
 const JOINED_NEIGHBOURS: usize = 10;
-/// Keyframes that one adjustment may move: its equations are dense in them.
-const MAX_ADJUSTED: usize = 100;
 
 /// Closes a recognised loop; `edges` are those of earlier loops and get this one's. Returns the keyframes that may have moved.
 pub fn correct(
@@ -43,8 +41,15 @@ pub fn correct(
     graph.edges = skeleton(map, depth);
     edges.push(Edge { doubt: Some(DOUBT), ..edge(found.keyframe, found.place, keyframe_from_place, found.matches.len(), depth) });
     graph.edges.extend(edges.iter());
+    let measured = map.measured.values().map(|m| m.edge(m.keyframe, m.relative_to));
+    graph.edges.extend(measured.filter(|e| is_believed(e, &before[e.a], &before[e.b])));
     graph.optimise(GRAPH_STEPS);
     move_map(map, &before, &graph.poses, config);
+    let living: Vec<usize> = (0..before.len()).map(|k| map.living(k)).collect();
+    let growth = |k: usize| 1.0 / graph.poses[living[k]].scale;
+    map.culled.iter_mut().for_each(|(k, held)| held.camera_from_holder.translation.vector *= growth(*k));
+    map.carry_culled();
+    map.measured.values_mut().for_each(|m| m.keyframe_from_relative.translation.vector *= growth(m.keyframe));
     let neighbours: Vec<usize> =
         map.covisible(found.keyframe).into_iter().filter(|(_, n)| *n >= CONNECTED_SHARED).map(|(k, _)| k).collect();
     take_over(map, found, config);
@@ -52,19 +57,17 @@ pub fn correct(
     for neighbour in neighbours.into_iter().take(JOINED_NEIGHBOURS) {
         join(map, neighbour, &found.landmarks, pinhole, config);
     }
-    let all: Vec<usize> = (1..map.keyframes.len()).collect();
-    if all.len() <= MAX_ADJUSTED {
-        adjust(map, &all, &[0], pinhole, config);
-    }
-    graph.poses.iter().enumerate().skip(1).map(|(k, pose)| (k, 1.0 / pose.scale)).collect()
+    (1..graph.poses.len()).map(|k| (k, growth(k))).collect()
 }
 
 /// The edges that hold the map together: each keyframe with the older one that it shares most with, and with others if that is much.
 fn skeleton(map: &Map, depth: f64) -> Vec<Edge> {
     let mut edges = Vec::new();
-    for a in 1..map.keyframes.len() {
+    let mut last = 0;
+    for a in (1..map.keyframes.len()).filter(|k| !map.culled.contains_key(k)) {
         let older: Vec<(usize, usize)> = map.covisible(a).into_iter().filter(|(b, _)| *b < a).take(STRONG_NEIGHBOURS).collect();
-        let (parent, shared) = older.first().copied().unwrap_or((a - 1, 1));
+        let (parent, shared) = older.first().copied().unwrap_or((last, 1));
+        last = a;
         let strong = older.into_iter().skip(1).filter(|(_, shared)| *shared >= STRONG_SHARED);
         for (b, shared) in std::iter::once((parent, shared)).chain(strong) {
             let a_from_b = map.keyframes[a].camera_from_world * map.keyframes[b].camera_from_world.inverse();

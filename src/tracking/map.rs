@@ -1,7 +1,9 @@
 //! The sparse map: keyframes, landmarks, who sees what, and the covisibility that follows from it.
 //!
-//! Everything is indexed by its place in a `Vec` (ids never change and are never reused), so every walk has one order.
+//! Everything is indexed by its place in a `Vec` (ids never change and are never reused), so every walk has one order. A culled keyframe
+//! keeps its place and its pose, and nothing else.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use nalgebra::{Point3, Vector2, Vector3};
@@ -10,6 +12,7 @@ use super::TrackingConfig;
 use super::descriptor::{Descriptor, representative};
 use super::frame_features::FrameFeatures;
 use super::places::Places;
+use super::relative_pose::PoseMeasurement;
 use crate::geometry::{Pinhole, Se3};
 
 /// A landmark is looked for only within 60° of the mean direction from which it was seen.
@@ -63,6 +66,13 @@ pub struct Keyframe {
     pub landmarks: Vec<Option<usize>>,
 }
 
+/// What is left of a culled keyframe: it goes rigidly with a living one.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Held {
+    pub by: usize,
+    pub camera_from_holder: Se3,
+}
+
 /// Where a landmark should appear.
 #[derive(Clone, Copy, Debug)]
 pub struct Prediction {
@@ -79,6 +89,10 @@ pub struct Map {
     pub landmarks: Vec<Landmark>,
     /// By which keyframes are recognised.
     pub places: Places,
+    /// By keyframe; none is held by another culled one.
+    pub culled: BTreeMap<usize, Held>,
+    /// By pair of living keyframes, the lower id first.
+    pub measured: BTreeMap<(usize, usize), PoseMeasurement>,
 }
 
 impl Map {
@@ -224,6 +238,18 @@ impl Map {
         let mut ranked = self.votes(self.keyframes[keyframe].landmarks.iter().flatten().copied());
         ranked.retain(|(other, _)| *other != keyframe);
         ranked
+    }
+
+    /// The keyframe itself if it lives, else the one that it goes with.
+    pub fn living(&self, keyframe: usize) -> usize {
+        self.culled.get(&keyframe).map_or(keyframe, |held| held.by)
+    }
+
+    /// Puts culled keyframes where those that hold them have moved.
+    pub fn carry_culled(&mut self) {
+        for (keyframe, held) in &self.culled {
+            self.keyframes[*keyframe].camera_from_world = held.camera_from_holder * self.keyframes[held.by].camera_from_world;
+        }
     }
 
     /// Median depth of the landmarks that a keyframe sees, metres.

@@ -3,11 +3,13 @@
 //!
 //! One frame: features, with depth where the sensor gives it → the pose predicted from the last motion → last frame's points → the local
 //! map; all pixels where features are too few (RGB-D). Now and then a keyframe: landmarks from depth and by triangulation, joined with
-//! what its neighbours see → local bundle adjustment → loop closing. All in the caller's thread, in one fixed order: the same frames give
-//! the same bits. Knows nothing of the mapper or the GPU.
+//! what its neighbours see → local bundle adjustment in a thread beside → loop closing → culling of what became redundant. Only the
+//! caller's thread changes the map, and unpaced it does so in one fixed order: the same frames give the same bits. Knows nothing of the
+//! mapper or the GPU.
 
 mod bundle;
 mod config;
+mod culling;
 mod dense;
 mod descriptor;
 mod error;
@@ -29,15 +31,19 @@ mod mono;
 mod places;
 mod pose;
 mod pose_graph;
+mod reduced;
+mod relative_pose;
 mod relocalise;
 mod spread;
 mod stereo;
 mod tracker;
 mod triangulate;
 mod window;
+mod worker;
 
 pub use config::TrackingConfig;
 pub use error::TrackingError;
+pub use relative_pose::PoseMeasurement;
 pub use tracker::Tracker;
 
 use nalgebra::Vector2;
@@ -62,7 +68,7 @@ pub struct TrackedFrame {
     pub inliers: usize,
     /// Set if this frame became a keyframe.
     pub keyframe: Option<NewKeyframe>,
-    /// Earlier keyframes that bundle adjustment or a closed loop moved: id, new world_from_camera.
+    /// Earlier keyframes that bundle adjustment or a closed loop moved, as they were taken in with this frame: id, new world_from_camera.
     pub updates: Vec<(usize, Se3)>,
     /// Where the time went; the only part of the answer that differs from run to run.
     pub times: StageTimes,
@@ -73,6 +79,7 @@ pub struct TrackedFrame {
 pub struct NewKeyframe {
     /// Counts from 0 in the order of creation.
     pub id: usize,
+    /// Before its bundle adjustment, whose result follows as an update.
     pub world_from_camera: Se3,
     /// Where it sees landmarks, and how far along z: pixels of the distortion-free pinhole, metres. For the mapper of a camera without a
     /// depth image; empty where frames have one.
@@ -105,7 +112,7 @@ pub struct StageTimes {
     pub localise_ms: f64,
     /// New landmarks, joining with neighbours.
     pub mapping_ms: f64,
-    /// Local bundle adjustment.
+    /// What bundle adjustment costs this thread: putting it together, waiting for it, taking it in.
     pub bundle_ms: f64,
     /// Looking for a loop, and closing it.
     pub loops_ms: f64,

@@ -65,6 +65,19 @@ impl Places {
         }
     }
 
+    /// Forgets a keyframe that was inserted with these features.
+    pub fn remove(&mut self, keyframe: usize, features: &[Feature]) {
+        if let Some(count) = self.features.get_mut(keyframe) {
+            *count = 0;
+        }
+        for feature in features {
+            let node = self.leaf(&feature.descriptor);
+            if let Node::Leaf(entries) = &mut self.nodes[node] {
+                entries.retain(|e| e.keyframe as usize != keyframe);
+            }
+        }
+    }
+
     /// The keyframes that show some of these features, most alike first, then newest first.
     pub fn query(&self, features: &[Feature]) -> Vec<Resemblance> {
         let mut votes = vec![0usize; self.features.len()];

@@ -1,12 +1,17 @@
-//! The tracker: one frame at a time to a pose, and now and then a keyframe. Owns the map; runs in the caller's thread.
+//! The tracker: one frame at a time to a pose, and now and then a keyframe. Owns the map; runs in the caller's thread, with bundle
+//! adjustment in a thread of its own.
 //!
 //! It leaves out what the rest of the project does elsewhere: rendering.
 
+mod adjusting;
 mod start;
 mod without_features;
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::Instant;
+
+use adjusting::Adjusting;
 
 use super::dense::{DenseFrame, DenseSampler};
 use super::features::Extractor;
@@ -16,9 +21,9 @@ use super::localise::{Context, Localised};
 use super::loop_closing::LoopCloser;
 use super::map::{Keyframe, Map};
 use super::mono::FirstView;
+use super::worker::Worker;
 use super::{
     KeyframePose, NewKeyframe, StageTimes, TrackedFrame, TrackingConfig, TrackingError, TrackingState, mapping, triangulate,
-    window,
 };
 use crate::geometry::{Camera, Se3, StampedPose};
 use crate::sequence::{Frame, Sensor};
@@ -61,6 +66,9 @@ pub struct Tracker {
     dense_last: Option<Arc<DenseFrame>>,
     dense_keyframe: Option<(usize, Arc<DenseFrame>)>,
     records: Vec<Record>,
+    adjusting: Adjusting,
+    /// Keyframes that moved since the last frame's answer.
+    moved: BTreeSet<usize>,
 }
 
 /// The last frame that has a pose.
@@ -85,7 +93,7 @@ impl Tracker {
     /// A tracker for one camera.
     ///
     /// # Errors
-    /// [`TrackingError::Config`] if a setting is out of its range.
+    /// [`TrackingError::Config`] if a setting is out of its range, [`TrackingError::Spawn`] if the system gives no thread.
     pub fn new(camera: Camera, sensor: Sensor, config: &TrackingConfig) -> Result<Self, TrackingError> {
         config.validate().map_err(TrackingError::Config)?;
         let spacing = if sensor == Sensor::Mono { MONO_SPACING } else { 1.0 };
@@ -94,6 +102,7 @@ impl Tracker {
             keyframe_rotation_rad: spacing * config.keyframe_rotation_rad,
             ..config.clone()
         };
+        let worker = Worker::start(camera.pinhole, config.bundle_iterations)?;
         Ok(Self {
             camera,
             sensor,
@@ -113,7 +122,17 @@ impl Tracker {
             frames_since_found: FRESHLY_FOUND_FRAMES,
             frames_seen: 0,
             records: Vec::new(),
+            adjusting: Adjusting::new(worker),
+            moved: BTreeSet::new(),
         })
+    }
+
+    /// Paced replay, where frames do not wait: bundle adjustment is taken in when it is ready instead of at a fixed frame. What comes
+    /// out then depends on how fast the machine is.
+    #[must_use]
+    pub fn paced(mut self, paced: bool) -> Self {
+        self.adjusting.paced = paced;
+        self
     }
 
     /// Tracks the next frame. `may_be_keyframe` is false for frames that are held out from the mapper; until there is a map, such
@@ -132,34 +151,44 @@ impl Tracker {
         let sampled = self.sampler.as_ref().zip(frame.depth.as_ref());
         let dense = sampled.map(|(sampler, depth)| Arc::new(sampler.sample(&grey, depth, &self.config)));
         times.features_ms = milliseconds(clock);
-        let Some(last) = self.last.take() else {
-            let start = if self.sensor == Sensor::Mono { Self::start_without_depth } else { Self::start };
-            let tracked = start(self, frame, features, may_be_keyframe, times);
-            self.keep_dense(dense, tracked.keyframe.is_some());
-            return Ok(tracked);
+        self.take_adjusted(&mut times)?;
+        let mut tracked = match self.last.take() {
+            Some(last) => self.go_on(frame, features, dense.as_deref(), last, may_be_keyframe, times)?,
+            None if self.sensor == Sensor::Mono => self.start_without_depth(frame, features, may_be_keyframe, times),
+            None => self.start(frame, features, may_be_keyframe, times),
         };
+        if tracked.state == TrackingState::Tracking {
+            self.keep_dense(dense, tracked.keyframe.is_some());
+        }
+        tracked.updates = self.updates();
+        Ok(tracked)
+    }
+
+    /// Tracks a frame when there is a map.
+    fn go_on(
+        &mut self,
+        frame: &Frame,
+        features: Arc<FrameFeatures>,
+        dense: Option<&DenseFrame>,
+        last: LastFrame,
+        may_be_keyframe: bool,
+        mut times: StageTimes,
+    ) -> Result<TrackedFrame, TrackingError> {
         let clock = Instant::now();
         let mut found = self.localise(&features, &last);
         if found.as_ref().is_none_or(|f| f.inliers < FEW_INLIERS) {
             let guess = found.as_ref().map(|f| f.camera_from_world);
-            found = self.localise_densely(dense.as_deref(), &features, &last, guess).or(found);
+            found = self.localise_densely(dense, &features, &last, guess).or(found);
         }
         times.localise_ms = milliseconds(clock);
-        let tracked = match found {
-            Some(found) => {
-                let tracked = self.accept(frame, features, &last, found, may_be_keyframe, times);
-                self.keep_dense(dense, tracked.keyframe.is_some());
-                tracked
-            }
-            None => {
-                self.last = Some(last);
-                self.frames_lost += 1;
-                self.lost = true;
-                self.velocity = None;
-                TrackedFrame::lost(times)
-            }
-        };
-        Ok(tracked)
+        if let Some(found) = found {
+            return self.accept(frame, features, &last, found, may_be_keyframe, times);
+        }
+        self.last = Some(last);
+        self.frames_lost += 1;
+        self.lost = true;
+        self.velocity = None;
+        Ok(TrackedFrame::lost(times))
     }
 
     /// Final pose of every tracked frame (index in the sequence, pose), each carried by its reference keyframe so that later
@@ -181,6 +210,11 @@ impl Tracker {
             world_from_camera: k.camera_from_world.inverse(),
         };
         self.map.keyframes.iter().enumerate().map(pose).collect()
+    }
+
+    /// How many keyframes have not been culled.
+    pub fn living_keyframes(&self) -> usize {
+        self.map.keyframes.len() - self.map.culled.len()
     }
 
     fn check(&self, frame: &Frame) -> Result<(), TrackingError> {
@@ -240,73 +274,55 @@ impl Tracker {
         found: Localised,
         may_be_keyframe: bool,
         mut times: StageTimes,
-    ) -> TrackedFrame {
+    ) -> Result<TrackedFrame, TrackingError> {
         self.frames_since_found = if self.lost { 0 } else { self.frames_since_found + 1 };
         self.velocity = (!self.lost).then(|| found.camera_from_world * last.camera_from_world.inverse());
         self.lost = false;
         self.frames_lost = 0;
         let votes = self.map.votes(found.landmarks.iter().flatten().copied());
         self.reference = votes.first().map_or(self.reference, |(k, _)| *k);
-        let inliers = found.inliers;
         let due = may_be_keyframe && keyframe::is_due(&self.map, &features, &found, self.reference, &self.config);
-        let (mut new_keyframe, mut updates) = (None, Vec::new());
-        if due {
-            let keyframe;
-            (keyframe, updates) = self.make_keyframe(frame, features, found, &mut times);
-            self.record(frame, keyframe.id, Se3::identity());
-            new_keyframe = Some(keyframe);
-        } else {
-            let camera_from_reference = found.camera_from_world * self.map.keyframes[self.reference].camera_from_world.inverse();
-            self.record(frame, self.reference, camera_from_reference);
-            self.last = Some(LastFrame { features, camera_from_world: found.camera_from_world, landmarks: found.landmarks });
-        }
-        TrackedFrame {
+        let Localised { camera_from_world, landmarks, inliers, dense, .. } = found;
+        let camera_from_reference = camera_from_world * self.map.keyframes[self.reference].camera_from_world.inverse();
+        self.record(frame, self.reference, camera_from_reference);
+        self.last = Some(LastFrame { features, camera_from_world, landmarks });
+        let new_keyframe = if due { self.make_keyframe(frame, !dense, &mut times)? } else { None };
+        Ok(TrackedFrame {
             state: TrackingState::Tracking,
             world_from_camera: self.last.as_ref().map(|l| l.camera_from_world.inverse()),
             inliers,
             keyframe: new_keyframe,
-            updates,
+            updates: Vec::new(),
             times,
-        }
+        })
     }
 
-    fn make_keyframe(
-        &mut self,
-        frame: &Frame,
-        features: Arc<FrameFeatures>,
-        found: Localised,
-        times: &mut StageTimes,
-    ) -> (NewKeyframe, Vec<(usize, Se3)>) {
+    /// Makes the frame that was just tracked a keyframe. `held`: by landmarks, instead of by all pixels.
+    fn make_keyframe(&mut self, frame: &Frame, held: bool, times: &mut StageTimes) -> Result<Option<NewKeyframe>, TrackingError> {
+        self.settle_for_keyframe(times)?;
+        let Some(LastFrame { features, camera_from_world, landmarks }) = self.last.take() else { return Ok(None) };
         let (pinhole, config) = (&self.camera.pinhole, &self.config);
-        let held_by_landmarks = !found.dense;
         let clock = Instant::now();
         let keyframe = Keyframe {
             frame_index: frame.index,
             timestamp_s: frame.timestamp_s,
-            camera_from_world: found.camera_from_world,
+            camera_from_world,
             features: features.clone(),
-            landmarks: found.landmarks,
+            landmarks,
         };
         let id = mapping::insert_keyframe(&mut self.map, keyframe, pinhole, config);
         triangulate::triangulate_with_neighbours(&mut self.map, id, pinhole, config);
         mapping::join_neighbours(&mut self.map, id, pinhole, config);
         mapping::remove_unproven(&mut self.map, id);
-        times.mapping_ms = milliseconds(clock);
-        let clock = Instant::now();
-        // A keyframe that few landmarks hold would be torn from where its pixels put it.
-        let mut moved = if held_by_landmarks { window::adjust_window(&mut self.map, id, pinhole, config) } else { Vec::new() };
-        times.bundle_ms = milliseconds(clock);
-        let clock = Instant::now();
-        if let Some(bent) = self.close_loop(id) {
-            moved = bent;
-        }
-        times.loops_ms = milliseconds(clock);
-        let pose = |k: usize| self.map.keyframes[k].camera_from_world;
-        let updates = moved.into_iter().filter(|k| *k != id).map(|k| (k, pose(k).inverse())).collect();
-        let camera_from_world = pose(id);
+        times.mapping_ms += milliseconds(clock);
         self.reference = id;
+        self.records.pop();
+        self.record(frame, id, Se3::identity());
         self.last = Some(LastFrame { features, camera_from_world, landmarks: self.map.keyframes[id].landmarks.clone() });
-        (self.describe(id), updates)
+        self.adjust_around(id, held, times)?;
+        // Its pose goes out with itself.
+        self.moved.remove(&id);
+        Ok(Some(self.describe(id)))
     }
 
     /// What the mapper is told of a keyframe.
@@ -320,17 +336,6 @@ impl Tracker {
         };
         let world_from_camera = keyframe.camera_from_world.inverse();
         NewKeyframe { id, world_from_camera, seen, covisible: self.map.covisible(id) }
-    }
-
-    /// Closes a loop if the newest keyframe shows one: returns the keyframes that may have moved. Frames follow their keyframes.
-    fn close_loop(&mut self, keyframe: usize) -> Option<Vec<usize>> {
-        let moved =
-            self.config.loop_closing.then(|| self.loops.close(&mut self.map, keyframe, &self.camera.pinhole, &self.config))?;
-        for (keyframe, growth) in &moved {
-            let theirs = self.records.iter_mut().filter(|r| r.reference == *keyframe);
-            theirs.for_each(|r| r.camera_from_reference.translation.vector *= *growth);
-        }
-        (!moved.is_empty()).then(|| moved.into_iter().map(|(k, _)| k).collect())
     }
 
     fn record(&mut self, frame: &Frame, reference: usize, camera_from_reference: Se3) {

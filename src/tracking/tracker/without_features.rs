@@ -43,9 +43,6 @@ impl Tracker {
 
     /// Keeps a tracked frame's pixels for the next.
     pub(super) fn keep_dense(&mut self, dense: Option<Arc<DenseFrame>>, is_keyframe: bool) {
-        if self.last.is_none() {
-            return;
-        }
         if is_keyframe {
             self.dense_keyframe = dense.clone().map(|view| (self.map.keyframes.len() - 1, view));
         }

@@ -1,0 +1,209 @@
+//! Bundle adjustment beside tracking: when it begins, when its result is taken into the map, and what follows then: the search for a
+//! loop, and the culling of keyframes.
+//!
+//! One adjustment is under way at a time, and everything that changes the map happens here, in the tracking thread. Unpaced, a result is
+//! taken in at a fixed frame, or before the next keyframe is made, so that replay repeats to the bit. Paced, it is taken in when it is
+//! ready, and keyframes that come meanwhile wait for the next adjustment, which takes them along.
+
+use std::time::Instant;
+
+use super::super::culling::cull_around;
+use super::super::window::Adjustment;
+use super::super::worker::Worker;
+use super::super::{PoseMeasurement, StageTimes, TrackingError, relative_pose};
+use super::{Tracker, milliseconds};
+use crate::geometry::Se3;
+use crate::sequence::Sensor;
+
+/// Unpaced: frames after its keyframe at which an adjustment is taken in, at most, and as a share of those since the keyframe before:
+/// where keyframes follow each other closely the map must not lag behind. Points that were only triangulated are poor until they are
+/// adjusted: without depth it is always the next frame.
+const TAKEN_IN_AFTER: usize = 3;
+const TAKEN_IN_SHARE: usize = 4;
+
+/// The worker, and what it is at.
+#[derive(Debug)]
+pub(super) struct Adjusting {
+    worker: Worker,
+    pub paced: bool,
+    under_way: Option<UnderWay>,
+    /// The frame, counted from 1, at which the newest keyframe was made, and frames since the one before.
+    newest_at: usize,
+    interval: usize,
+    /// The newest keyframe, if its surroundings are still to be adjusted.
+    waiting: Option<Waiting>,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct UnderWay {
+    /// The keyframe whose surroundings it adjusts; `None` for all keyframes, after a loop.
+    around: Option<usize>,
+    /// Unpaced: the frame, counted from 1, at which it is taken in.
+    due: usize,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Waiting {
+    keyframe: usize,
+    /// Whether landmarks hold it, instead of all pixels.
+    held: bool,
+}
+
+impl Adjusting {
+    pub fn new(worker: Worker) -> Self {
+        Self { worker, paced: false, newest_at: 0, interval: 0, under_way: None, waiting: None }
+    }
+}
+
+impl Tracker {
+    /// Waits for all that is under way and takes it in: to be called when no frame is left. Returns the keyframes that moved since the
+    /// last frame: id, new world_from_camera.
+    ///
+    /// # Errors
+    /// [`TrackingError::Adjusting`] if the adjustment panicked.
+    pub fn finish(&mut self) -> Result<Vec<(usize, Se3)>, TrackingError> {
+        self.take_all_adjusted(&mut StageTimes::default())?;
+        Ok(self.updates())
+    }
+
+    /// Takes in relative poses of keyframes that someone else has measured, each in place of an earlier one of the same pair. The next
+    /// adjustments of these keyframes heed them.
+    ///
+    /// # Errors
+    /// [`TrackingError::Measurement`] if one has a number that is not finite or out of range, or an unknown keyframe; then none is taken.
+    pub fn measure(&mut self, measurements: &[PoseMeasurement]) -> Result<(), TrackingError> {
+        measurements.iter().try_for_each(|m| m.check(self.map.keyframes.len()))?;
+        measurements.iter().for_each(|m| relative_pose::keep(&mut self.map, *m));
+        Ok(())
+    }
+
+    /// Has the surroundings of a new keyframe adjusted, now or when the worker is free.
+    pub(super) fn adjust_around(&mut self, keyframe: usize, held: bool, times: &mut StageTimes) -> Result<(), TrackingError> {
+        self.adjusting.interval = self.frames_seen - self.adjusting.newest_at;
+        self.adjusting.newest_at = self.frames_seen;
+        self.adjusting.waiting = Some(Waiting { keyframe, held });
+        self.begin_next(times)
+    }
+
+    /// Takes in what has been adjusted, if it is time for it.
+    pub(super) fn take_adjusted(&mut self, times: &mut StageTimes) -> Result<(), TrackingError> {
+        let Some(under_way) = self.adjusting.under_way else { return Ok(()) };
+        if self.adjusting.paced {
+            let solved = self.adjusting.worker.poll()?;
+            return solved.map_or(Ok(()), |solved| self.take_in(under_way, &solved, times));
+        }
+        if self.frames_seen >= under_way.due { self.wait_for(under_way, times) } else { Ok(()) }
+    }
+
+    /// Takes in all that is under way, and what follows from it.
+    pub(super) fn take_all_adjusted(&mut self, times: &mut StageTimes) -> Result<(), TrackingError> {
+        while let Some(under_way) = self.adjusting.under_way {
+            self.wait_for(under_way, times)?;
+        }
+        Ok(())
+    }
+
+    /// Before a keyframe is made: unpaced, the one before must be settled; paced never waits.
+    pub(super) fn settle_for_keyframe(&mut self, times: &mut StageTimes) -> Result<(), TrackingError> {
+        if self.adjusting.paced { Ok(()) } else { self.take_all_adjusted(times) }
+    }
+
+    fn wait_for(&mut self, under_way: UnderWay, times: &mut StageTimes) -> Result<(), TrackingError> {
+        let clock = Instant::now();
+        let solved = self.adjusting.worker.wait()?;
+        times.bundle_ms += milliseconds(clock);
+        self.take_in(under_way, &solved, times)
+    }
+
+    fn take_in(&mut self, under_way: UnderWay, solved: &Adjustment, times: &mut StageTimes) -> Result<(), TrackingError> {
+        let clock = Instant::now();
+        self.adjusting.under_way = None;
+        self.moved.extend(solved.apply(&mut self.map, &self.config));
+        times.bundle_ms += milliseconds(clock);
+        if let Some(keyframe) = under_way.around {
+            self.look_round(keyframe, times)?;
+        }
+        self.follow_keyframe();
+        self.begin_next(times)
+    }
+
+    /// Begins the next adjustment if none is under way.
+    fn begin_next(&mut self, times: &mut StageTimes) -> Result<(), TrackingError> {
+        if self.adjusting.under_way.is_some() {
+            return Ok(());
+        }
+        let Some(Waiting { keyframe, held }) = self.adjusting.waiting.take() else { return Ok(()) };
+        let clock = Instant::now();
+        // A keyframe that few landmarks hold would be torn from where its pixels put it.
+        let window = held.then(|| Adjustment::of_window(&self.map, keyframe, &self.config)).flatten();
+        times.bundle_ms += milliseconds(clock);
+        match window {
+            Some(window) => self.begin(window, Some(keyframe)),
+            None => self.look_round(keyframe, times),
+        }
+    }
+
+    fn begin(&mut self, adjustment: Adjustment, around: Option<usize>) -> Result<(), TrackingError> {
+        self.adjusting.worker.give(adjustment)?;
+        let most = if self.sensor == Sensor::Mono { 1 } else { TAKEN_IN_AFTER };
+        let later = (self.adjusting.interval / TAKEN_IN_SHARE).clamp(1, most);
+        self.adjusting.under_way = Some(UnderWay { around, due: self.frames_seen + later });
+        Ok(())
+    }
+
+    /// What follows when a keyframe's surroundings are as good as they get: a loop may be seen, after which all is adjusted, or some of
+    /// them may have become redundant.
+    fn look_round(&mut self, keyframe: usize, times: &mut StageTimes) -> Result<(), TrackingError> {
+        let clock = Instant::now();
+        let closed = self.close_loop(keyframe);
+        times.loops_ms += milliseconds(clock);
+        if closed && let Some(all) = Adjustment::of_all(&self.map, &self.config) {
+            return self.begin(all, None);
+        }
+        let clock = Instant::now();
+        if !closed && self.config.keyframe_culling {
+            cull_around(&mut self.map, keyframe, |k| self.loops.holds(k), &self.config);
+            self.reference = self.map.living(self.reference);
+        }
+        times.mapping_ms += milliseconds(clock);
+        Ok(())
+    }
+
+    /// Closes a loop if a keyframe shows one, and says whether it did. Frames follow their keyframes.
+    fn close_loop(&mut self, keyframe: usize) -> bool {
+        if !self.config.loop_closing {
+            return false;
+        }
+        let moved = self.loops.close(&mut self.map, keyframe, &self.camera.pinhole, &self.config);
+        for (keyframe, growth) in &moved {
+            let theirs = self.records.iter_mut().filter(|r| r.reference == *keyframe);
+            theirs.for_each(|r| r.camera_from_reference.translation.vector *= *growth);
+            if *keyframe == self.reference
+                && let Some(velocity) = &mut self.velocity
+            {
+                velocity.translation.vector *= *growth;
+            }
+        }
+        self.moved.extend(moved.iter().map(|(k, _)| *k));
+        self.follow_keyframe();
+        !moved.is_empty()
+    }
+
+    /// The last frame goes with the keyframe that holds it, and forgets landmarks that are no more.
+    fn follow_keyframe(&mut self) {
+        let (Some(last), Some(record)) = (&mut self.last, self.records.last()) else { return };
+        let keyframe = &self.map.keyframes[record.reference];
+        last.camera_from_world = record.camera_from_reference * keyframe.camera_from_world;
+        if record.frame_index == keyframe.frame_index {
+            last.landmarks.clone_from(&keyframe.landmarks);
+        } else {
+            last.landmarks.iter_mut().for_each(|l| *l = l.and_then(|l| self.map.resolve(l)));
+        }
+    }
+
+    /// Keyframes that moved since this was last asked: id, new world_from_camera.
+    pub(super) fn updates(&mut self) -> Vec<(usize, Se3)> {
+        let pose = |k: usize| self.map.keyframes[k].camera_from_world.inverse();
+        std::mem::take(&mut self.moved).into_iter().map(|k| (k, pose(k))).collect()
+    }
+}
