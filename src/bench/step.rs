@@ -104,7 +104,7 @@ impl StepRunner {
     }
 
     fn steps(&mut self, count: usize) -> Result<(), GpuError> {
-        let views = [TrainingView { camera: self.scene.camera, target: &self.scene.target, scored: None }; BATCH];
+        let views = [TrainingView { camera: self.scene.camera, target: &self.scene.target, scored: None, pace: 1.0 }; BATCH];
         let configs = (&LossConfig::default(), &self.still);
         self.optimiser.steps(&mut self.rasterizer, &self.scene.cloud, &views[..count], configs)?;
         Ok(())

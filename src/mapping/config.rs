@@ -53,11 +53,14 @@ pub struct WindowConfig {
     pub covisible: usize,
     /// Share of steps that go to any older keyframe, so that the map does not forget.
     pub older_share: f32,
+    /// After each keyframe Adam's step sizes fall evenly to this share of themselves: new Gaussians move fast, and the map has settled
+    /// when the next keyframe comes.
+    pub last_pace: f32,
 }
 
 impl Default for WindowConfig {
     fn default() -> Self {
-        Self { recent: 6, covisible: 3, older_share: 0.6 }
+        Self { recent: 6, covisible: 3, older_share: 0.6, last_pace: 1.0 }
     }
 }
 

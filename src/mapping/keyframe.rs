@@ -54,12 +54,12 @@ impl MappedKeyframe {
     }
 
     /// What a step learns from; coarse where that is wished and there is a smaller image.
-    pub fn view(&self, coarse: bool, scored: Option<WrongPixels>) -> TrainingView<'_> {
+    pub fn view(&self, coarse: bool, pace: f32, scored: Option<WrongPixels>) -> TrainingView<'_> {
         match self.half.as_ref().filter(|_| coarse) {
-            None => TrainingView { camera: self.camera, target: &self.target, scored },
+            None => TrainingView { camera: self.camera, target: &self.target, scored, pace },
             Some(target) => {
                 let pinhole = halved_pinhole(&self.camera.pinhole);
-                TrainingView { camera: ViewCamera { pinhole, ..self.camera }, target, scored }
+                TrainingView { camera: ViewCamera { pinhole, ..self.camera }, target, scored, pace }
             }
         }
     }

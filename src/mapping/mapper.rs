@@ -195,12 +195,12 @@ impl Mapper {
         self.optimiser.begin_scores(&self.gpu, &self.cloud)?;
         let views = self.config.density.views.min(window.len());
         let chosen: Vec<Step> =
-            (0..views).map(|k| Step { keyframe: window[k * window.len() / views], coarse: false }).collect();
+            (0..views).map(|k| Step { keyframe: window[k * window.len() / views], coarse: false, pace: self.config.window.last_pace }).collect();
         Ok(self.steps(&chosen, Some(wrong))?.len())
     }
 
     fn steps(&mut self, batch: &[Step], scored: Option<WrongPixels>) -> Result<Vec<StepReport>, MappingError> {
-        let views: Vec<TrainingView<'_>> = batch.iter().map(|step| self.keyframes[step.keyframe].view(step.coarse, scored)).collect();
+        let views: Vec<TrainingView<'_>> = batch.iter().map(|step| self.keyframes[step.keyframe].view(step.coarse, step.pace, scored)).collect();
         let started = Instant::now();
         let reports = self.optimiser.steps(&mut self.rasterizer, &self.cloud, &views, (&self.config.loss, &self.config.adam))?;
         self.step_times.extend(std::iter::repeat_n(started.elapsed() / batch.len().max(1) as u32, batch.len()));

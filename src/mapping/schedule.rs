@@ -32,11 +32,13 @@ pub(super) struct Session {
 }
 
 /// What one step learns from.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Step {
     pub keyframe: usize,
     /// At half the size.
     pub coarse: bool,
+    /// Share of Adam's step sizes.
+    pub pace: f32,
 }
 
 impl Session {
@@ -60,7 +62,8 @@ impl Session {
             } else {
                 self.window[taken % self.window.len()]
             };
-            Step { keyframe, coarse: (taken as f32) < skip.coarse_share * self.steps as f32 }
+            let elapsed = taken as f32 / self.steps as f32;
+            Step { keyframe, coarse: elapsed < skip.coarse_share, pace: 1.0 - (1.0 - config.last_pace) * elapsed }
         };
         let steps = (self.taken..self.taken + count).map(draw).collect();
         self.taken += count;

@@ -66,8 +66,8 @@ impl AdamConfig {
 }
 
 impl AdamConfig {
-    /// The GPU's copy for step number `step` of the map.
-    pub(super) fn setup(&self, step: usize) -> AdamSetup {
+    /// The GPU's copy for step number `step` of the map, with all rates times `pace`.
+    pub(super) fn setup(&self, step: usize, pace: f32) -> AdamSetup {
         let p = self.position_rate;
         let rates = [
             [p, p, p, self.opacity_rate],
@@ -76,6 +76,7 @@ impl AdamConfig {
             [self.color_rate; 4],
             [self.harmonics_rate; 4],
         ];
+        let rates = rates.map(|lanes| lanes.map(|rate| rate * pace));
         AdamSetup {
             rates,
             beta_1: self.beta_1,

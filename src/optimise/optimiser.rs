@@ -26,6 +26,8 @@ pub struct TrainingView<'a> {
     pub target: &'a TargetImage,
     /// Whether the step also scores the Gaussians (see [`Optimiser::begin_scores`]).
     pub scored: Option<WrongPixels>,
+    /// Share of Adam's step sizes that the step takes.
+    pub pace: f32,
 }
 
 /// What a step leaves behind on the GPU: sums of the loss, and the counters.
@@ -142,10 +144,10 @@ impl Optimiser {
         let mut pending: Vec<usize> = (0..views.len()).collect();
         while !pending.is_empty() {
             for (entry, &i) in pending.iter().enumerate() {
-                let TrainingView { camera, target, scored } = &views[i];
+                let TrainingView { camera, target, scored, pace } = &views[i];
                 let objective = Objective::Image(target, loss, scored.as_ref());
                 let started = Instant::now();
-                self.adam.write(&gpu, 0, &[adam.setup(self.steps)]);
+                self.adam.write(&gpu, 0, &[adam.setup(self.steps, *pace)]);
                 self.steps += 1;
                 let mut encoder = gpu.device.create_command_encoder(&Default::default());
                 self.encode(&mut encoder, rasterizer, cloud, (camera, [0.0; 3]), &objective, &Sink::Adam)?;
