@@ -177,7 +177,8 @@ fn adam_steps_agree() {
     for _ in 0..3 {
         let gradients = optimiser.gradients(&mut rasterizer, &on_gpu, &camera, &image, &loss).unwrap();
         for (i, gradient) in cloud64(&gradients.cloud).iter().enumerate() {
-            let mut rates = vec![f64::from(adam.position_rate); 3];
+            let size = (expected[i][3..6].iter().sum::<f64>() / 3.0).exp();
+            let mut rates = vec![f64::from(adam.position_rate) * size; 3];
             rates.extend([f64::from(adam.scale_rate); 3]);
             rates.extend([f64::from(adam.rotation_rate); 4]);
             rates.push(f64::from(adam.opacity_rate));

@@ -2,7 +2,8 @@
 // were blended in this view get here; each counts its own steps, so that the bias correction is right for those often skipped.
 
 struct AdamSetup {
-    // Step sizes by lane: plane 0 (position ×3, opacity), log scale, rotation, constant colour, other harmonics.
+    // Step sizes by lane: plane 0 (position ×3, in units of the Gaussian's own size; opacity), log scale, rotation, constant colour, other
+    // harmonics.
     rates: array<vec4<f32>, 5>,
     beta_1: f32,
     beta_2: f32,
@@ -22,9 +23,13 @@ struct AdamSetup {
 // Bias corrections 1/(1 - βⁿ) of the first and the second moments after this step: of all planes, and of the higher harmonics.
 var<private> corrections: vec2<f32>;
 var<private> corrections_of_harmonics: vec2<f32>;
+// Geometric mean of the standard deviations, metres.
+var<private> size: f32;
 
 // Lane w of planes 1 and 3 is free; in the first moments these count the Gaussian's steps, of all and of its higher harmonics.
 fn begin_gradient(i: u32) {
+    let log_scale = parameters[view.capacity + i];
+    size = min(exp((log_scale.x + log_scale.y + log_scale.z) / 3.0), 1e3);
     corrections = count_step(view.capacity + i);
     if adam.step_harmonics == 1u {
         corrections_of_harmonics = count_step(3u * view.capacity + i);
@@ -49,7 +54,8 @@ fn store_gradient(plane: u32, i: u32, raw: vec4<f32>) {
     let before = moments_1[at];
     let m = mix(gradient, before, adam.beta_1);
     let v = mix(gradient * gradient, moments_2[at], adam.beta_2);
-    let rate = adam.rates[min(plane, 4u)] * correction.x;
+    let unit = select(vec4(1.0), vec4(size, size, size, 1.0), plane == 0u);
+    let rate = adam.rates[min(plane, 4u)] * unit * correction.x;
     parameters[at] -= rate * m / (sqrt(v * correction.y) + adam.epsilon);
     moments_1[at] = select(m, vec4(m.xyz, before.w), plane == 1u || plane == 3u);
     moments_2[at] = v;

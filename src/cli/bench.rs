@@ -141,7 +141,7 @@ fn step(args: &StepArgs) -> miette::Result<()> {
     let recorded = args.run.as_deref().map(RecordedView::open).transpose()?;
     for &gaussians in &args.gaussians {
         if let Some(view) = &recorded {
-            let cloud = view.thinned(gaussians);
+            let cloud = view.cloud.thinned(gaussians);
             let Pinhole { width, height, .. } = view.image.pinhole;
             let camera = ViewCamera { pinhole: view.image.pinhole, camera_from_world: view.world_from_camera.inverse() };
             let depth = view.image.depth.as_ref().map(|depth| depth.metres.as_slice());
@@ -187,16 +187,6 @@ impl RecordedView {
         let image = rectifier.rectify(&sequence.load(frame.min(sequence.entries.len() - 1)).into_diagnostic()?);
         let cloud = MapFormat::Ply.read(&dir.join(outputs::MAP)).into_diagnostic()?;
         Ok(Self { cloud, world_from_camera: middle.world_from_camera, image })
-    }
-
-    /// At most `count` Gaussians, spread evenly over the map.
-    fn thinned(&self, count: usize) -> GaussianCloud {
-        let mut cloud = GaussianCloud::new(self.cloud.sh_degree);
-        let count = count.min(self.cloud.len());
-        for i in 0..count {
-            cloud.push(self.cloud.get(i * self.cloud.len() / count));
-        }
-        cloud
     }
 }
 

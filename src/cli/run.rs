@@ -5,11 +5,11 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use clap::Args;
+use clap::{Args, ValueEnum};
 use indicatif::ProgressBar;
 use keysplat::config::{Config, SequenceConfig};
 use keysplat::gpu::Gpu;
-use keysplat::pipeline::{self, Outcome, PipelineError, Progress, outputs};
+use keysplat::pipeline::{self, Budget, Outcome, PipelineError, Progress, outputs};
 use keysplat::sequence::{Layout, Sensor, SensorKind, Sequence, is_camera_file};
 use miette::{IntoDiagnostic, miette};
 
@@ -49,6 +49,15 @@ pub struct RunArgs {
     /// Part of the name of the adapter to use (see `keysplat adapters`).
     #[arg(long)]
     adapter: Option<String>,
+    /// How much time the run may take; goes over the configuration file, and the other options over it.
+    #[arg(long, value_enum)]
+    budget: Option<BudgetName>,
+    /// Most Gaussians that the map may have at any time; the least useful go first.
+    #[arg(long)]
+    max_gaussians: Option<usize>,
+    /// Most GPU memory that the mapper may use, e.g. 500M or 2G.
+    #[arg(long, value_parser = parse_bytes)]
+    max_gpu_memory: Option<u64>,
     /// Set any value of the configuration, e.g. --set mapping.iterations_per_keyframe=20 (may be given again).
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
@@ -57,6 +66,40 @@ pub struct RunArgs {
 /// The same file, named from the root.
 fn absolute(path: &str) -> miette::Result<String> {
     Ok(std::path::absolute(path).into_diagnostic()?.to_string_lossy().into_owned())
+}
+
+/// See [`Budget`].
+#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum BudgetName {
+    /// Keep up with the recording's own pace: resolution and steps follow from what the adapter can do.
+    Realtime,
+    /// The defaults.
+    Balanced,
+    /// More steps and finer seeds.
+    Quality,
+}
+
+impl From<BudgetName> for Budget {
+    fn from(name: BudgetName) -> Self {
+        match name {
+            BudgetName::Realtime => Self::Realtime,
+            BudgetName::Balanced => Self::Balanced,
+            BudgetName::Quality => Self::Quality,
+        }
+    }
+}
+
+fn parse_bytes(text: &str) -> Result<u64, String> {
+    let digits = text.trim_end_matches(|c: char| !c.is_ascii_digit());
+    let unit: u64 = match text[digits.len()..].to_ascii_uppercase().as_str() {
+        "" | "B" => 1,
+        "K" | "KB" => 1 << 10,
+        "M" | "MB" => 1 << 20,
+        "G" | "GB" => 1 << 30,
+        _ => return Err(format!("`{text}` is no amount of memory; write 500M or 2G")),
+    };
+    let bytes = digits.parse::<u64>().ok().and_then(|n| n.checked_mul(unit));
+    bytes.ok_or_else(|| format!("`{text}` is no amount of memory; write 500M or 2G"))
 }
 
 fn parse_range(text: &str) -> Result<(usize, usize), String> {
@@ -70,6 +113,9 @@ fn parse_range(text: &str) -> Result<(usize, usize), String> {
 impl RunArgs {
     pub fn resolve(&self) -> miette::Result<Config> {
         let mut config = self.config.as_deref().map_or_else(|| Ok(Config::default()), Config::read).into_diagnostic()?;
+        if let Some(budget) = self.budget {
+            config = Budget::from(budget).apply(&config).into_diagnostic()?;
+        }
         if let Some(path) = &self.sequence {
             // Absolute, so that the written configuration finds it from anywhere.
             let path = std::path::absolute(path).into_diagnostic()?;
@@ -89,12 +135,19 @@ impl RunArgs {
         config.replay.frames = self.frames.or(config.replay.frames);
         config.replay.paced |= self.paced;
         config.adapter = self.adapter.clone().or(config.adapter);
+        config.mapping.limits.max_gaussians = self.max_gaussians.or(config.mapping.limits.max_gaussians);
+        config.mapping.limits.max_gpu_bytes = self.max_gpu_memory.or(config.mapping.limits.max_gpu_bytes);
         config.with_settings(&self.set).into_diagnostic()
     }
 }
 
 pub fn run(args: RunArgs, verbosity: Verbosity) -> miette::Result<()> {
-    let config = args.resolve()?;
+    let mut config = args.resolve()?;
+    if args.budget == Some(BudgetName::Realtime) && args.map_scale.is_none() {
+        let sequence = open(&mut config)?;
+        let gpu = Gpu::open(config.adapter.as_deref()).into_diagnostic()?;
+        config.map_scale = pipeline::realtime_scale(&gpu, &sequence, &config).into_diagnostic()?;
+    }
     let stop = Arc::new(AtomicBool::new(false));
     progress::stop_on_ctrl_c(&stop)?;
     replay(config, args.out, stop, verbosity)
@@ -224,7 +277,14 @@ fn show(windows: &Progress, bar: &ProgressBar, done: &AtomicBool) {
 
 #[cfg(test)]
 mod tests {
-    use super::parse_range;
+    use super::{parse_bytes, parse_range};
+
+    #[test]
+    fn amounts_of_memory_have_units() {
+        assert_eq!(parse_bytes("500M"), Ok(500 << 20));
+        assert_eq!((parse_bytes("2g"), parse_bytes("4096")), (Ok(2 << 30), Ok(4096)));
+        assert!(["", "M", "-1M", "5T", "99999999999999999999"].iter().all(|text| parse_bytes(text).is_err()));
+    }
 
     #[test]
     fn ranges_may_be_open() {

@@ -190,6 +190,11 @@ impl Gpu {
         self.check()
     }
 
+    /// Bytes that our buffers hold now.
+    pub fn bytes(&self) -> u64 {
+        self.memory.now.load(Ordering::Relaxed)
+    }
+
     /// The most bytes that our buffers held at any time.
     pub fn peak_bytes(&self) -> u64 {
         self.memory.peak.load(Ordering::Relaxed)

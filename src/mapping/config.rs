@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::DensityConfig;
+use super::{DensityConfig, LimitsConfig};
 use crate::optimise::{AdamConfig, LossConfig};
 use crate::splat::ShDegree;
 
@@ -16,10 +16,13 @@ pub struct MappingConfig {
     pub iterations_per_keyframe: usize,
     /// Steps after the first keyframe, which has no map to start from.
     pub first_iterations: usize,
+    /// Whether the steps after a keyframe end as soon as the next one waits: as many as there is time for. Such a run does not repeat.
+    pub yields_to_keyframes: bool,
     /// Seed of the draws among keyframes.
     pub seed: u64,
     pub window: WindowConfig,
     pub skip: SkipConfig,
+    pub limits: LimitsConfig,
     pub seeding: SeedingConfig,
     pub density: DensityConfig,
     pub loss: LossConfig,
@@ -32,9 +35,11 @@ impl Default for MappingConfig {
             sh_degree: ShDegree::new(1).expect("degrees 0 to 3 exist"),
             iterations_per_keyframe: 50,
             first_iterations: 100,
+            yields_to_keyframes: false,
             seed: 0,
             window: WindowConfig::default(),
             skip: SkipConfig::default(),
+            limits: LimitsConfig::default(),
             seeding: SeedingConfig::default(),
             density: DensityConfig::default(),
             loss: LossConfig::default(),
@@ -154,6 +159,7 @@ impl MappingConfig {
         if self.window.recent == 0 {
             return Err("mapping.window.recent must be at least 1".into());
         }
+        self.limits.validate().map_err(|e| format!("mapping.limits: {e}"))?;
         self.density.validate().map_err(|e| format!("mapping.density: {e}"))?;
         self.loss.validate().map_err(|e| format!("mapping.loss: {e}"))?;
         self.adam.validate().map_err(|e| format!("mapping.adam: {e}"))

@@ -26,12 +26,19 @@ pub struct Keyframe {
 pub(super) struct MappedKeyframe {
     pub id: KeyframeId,
     pub camera: ViewCamera,
-    target: TargetImage,
-    /// The same at half the size, where it is wanted.
-    half: Option<TargetImage>,
+    /// Until it is given back.
+    image: Option<Images>,
     pub covisible: Vec<KeyframeId>,
     /// At its last step; 1 before.
     pub loss: f32,
+}
+
+/// A keyframe's image on the GPU.
+#[derive(Debug)]
+struct Images {
+    whole: TargetImage,
+    /// The same at half the size, where it is wanted.
+    half: Option<TargetImage>,
 }
 
 impl MappedKeyframe {
@@ -46,22 +53,38 @@ impl MappedKeyframe {
         Ok(Self {
             id: keyframe.id,
             camera: ViewCamera { pinhole: image.pinhole, camera_from_world: keyframe.world_from_camera.inverse() },
-            target: target(image)?,
-            half: worth.then(|| target(&halved(image))).transpose()?,
+            image: Some(Images { whole: target(image)?, half: worth.then(|| target(&halved(image))).transpose()? }),
             covisible: keyframe.covisible.clone(),
             loss: 1.0,
         })
     }
 
-    /// What a step learns from; coarse where that is wished and there is a smaller image.
-    pub fn view(&self, coarse: bool, pace: f32, scored: Option<WrongPixels>) -> TrainingView<'_> {
-        match self.half.as_ref().filter(|_| coarse) {
-            None => TrainingView { camera: self.camera, target: &self.target, scored, pace },
+    /// Whether steps can still learn from it.
+    pub fn has_image(&self) -> bool {
+        self.image.is_some()
+    }
+
+    /// Gives the image back; the pose stays, for Gaussians move with it.
+    pub fn forget_image(&mut self) {
+        self.image = None;
+    }
+
+    /// Bytes of its image on the GPU.
+    pub fn image_bytes(&self) -> u64 {
+        let pixels = u64::from(self.camera.pinhole.width * self.camera.pinhole.height);
+        self.image.as_ref().map_or(0, |image| if image.half.is_some() { pixels * 10 } else { pixels * 8 })
+    }
+
+    /// What a step learns from; coarse where that is wished and there is a smaller image. `None` without an image.
+    pub fn view(&self, coarse: bool, pace: f32, scored: Option<WrongPixels>) -> Option<TrainingView<'_>> {
+        let image = self.image.as_ref()?;
+        Some(match image.half.as_ref().filter(|_| coarse) {
+            None => TrainingView { camera: self.camera, target: &image.whole, scored, pace },
             Some(target) => {
                 let pinhole = halved_pinhole(&self.camera.pinhole);
                 TrainingView { camera: ViewCamera { pinhole, ..self.camera }, target, scored, pace }
             }
-        }
+        })
     }
 }
 
@@ -79,9 +102,10 @@ fn halved(image: &RectifiedImage) -> RectifiedImage {
     let pinhole = halved_pinhole(&image.pinhole);
     let block = |x: u32, y: u32| [(0, 0), (1, 0), (0, 1), (1, 1)].map(|(dx, dy)| (2 * x + dx, 2 * y + dy));
     let color = RgbImage::from_fn(pinhole.width, pinhole.height, |x, y| {
-        let sum = block(x, y).map(|(x, y)| image.color.get_pixel(x, y).0.map(u32::from)).into_iter().fold([2; 3], |sum, c| {
-            [sum[0] + c[0], sum[1] + c[1], sum[2] + c[2]]
-        });
+        let sum = block(x, y)
+            .map(|(x, y)| image.color.get_pixel(x, y).0.map(u32::from))
+            .into_iter()
+            .fold([2; 3], |sum, c| [sum[0] + c[0], sum[1] + c[1], sum[2] + c[2]]);
         Rgb(sum.map(|s| (s / 4) as u8))
     });
     let depth = image.depth.as_ref().map(|depth| {

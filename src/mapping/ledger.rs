@@ -23,6 +23,8 @@ pub(super) struct Entry {
     pub views: u32,
     /// The most that it added to a pixel of these, 0 to 1.
     pub best_weight: f32,
+    /// The most that it added to one view, pixels.
+    pub worth: f32,
 }
 
 /// The entries, `[N]` in map order. Seeds are appended and pruning keeps the order, so most of a keyframe's Gaussians lie side by side.
@@ -50,6 +52,7 @@ impl Ledger {
         for (entry, score) in self.entries.iter_mut().zip(scores) {
             entry.views += score.views as u32;
             entry.best_weight = entry.best_weight.max(score.weight_max);
+            entry.worth = entry.worth.max(score.weight_sum / score.views.max(1.0));
         }
     }
 

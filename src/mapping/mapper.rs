@@ -11,7 +11,7 @@ use super::density::{self, Candidate};
 use super::keyframe::MappedKeyframe;
 use super::ledger::{self, Ledger};
 use super::schedule::{self, Session, Step};
-use super::{Keyframe, KeyframeId, MappingConfig, seeding};
+use super::{DensityStrategy, Keyframe, KeyframeId, LimitsConfig, MappingConfig, limits, seeding};
 use crate::geometry::Se3;
 use crate::gpu::{Gpu, GpuError};
 use crate::optimise::{GaussianScore, Optimiser, StepReport, TrainingView, WrongPixels};
@@ -85,6 +85,7 @@ impl Mapper {
         let mapped = MappedKeyframe::new(&self.gpu, keyframe, self.config.skip.coarse_share > 0.0)?;
         let seeded = self.seed(keyframe, &mapped.camera)?;
         self.keyframes.push(mapped);
+        self.limit_keyframes();
         let first = self.keyframes.len() == 1;
         let iterations = if first { self.config.first_iterations } else { self.config.iterations_per_keyframe };
         let (done, psnr_db) = self.optimise(iterations, stop)?;
@@ -130,10 +131,42 @@ impl Mapper {
 
     fn seed(&mut self, keyframe: &Keyframe, camera: &ViewCamera) -> Result<usize, MappingError> {
         let rendered = if self.cloud.is_empty() { None } else { Some(self.render(camera)?) };
-        let seeds = seeding::seed(keyframe, rendered.as_ref(), &self.config.seeding, self.config.sh_degree);
+        let mut seeds = seeding::seed(keyframe, rendered.as_ref(), &self.config.seeding, self.config.sh_degree);
+        if self.config.limits.limits_gaussians() {
+            let most = self.most_gaussians();
+            self.cloud.limit(most);
+            seeds = seeds.thinned(limits::seeds_allowed(seeds.len(), most));
+            let keep = limits::most_useful(self.ledger.entries(), most - seeds.len());
+            self.cloud.change(&self.gpu, &keep, (&[], &[]))?;
+            self.ledger.apply(&keep, std::iter::empty());
+        }
         let left_out = self.cloud.append(&self.gpu, &seeds)?;
         self.ledger.append(keyframe.id, seeds.len() - left_out);
         Ok(seeds.len())
+    }
+
+    /// How many Gaussians there may be, at present.
+    fn most_gaussians(&self) -> usize {
+        let each = self.cloud.bytes_each();
+        self.config.limits.gaussians(each, LimitsConfig::other_bytes(self.gpu.bytes(), each, self.cloud.capacity()))
+    }
+
+    /// Keyframes beyond their number give their images back.
+    fn limit_keyframes(&mut self) {
+        let most = self.keyframes.last().map_or(usize::MAX, |k| self.config.limits.keyframes(k.image_bytes()));
+        let mut kept = self.keyframes.iter().filter(|k| k.has_image()).count();
+        while kept > most
+            && let Some(k) = limits::least_missed(&self.keyframes, self.config.window.recent)
+        {
+            self.keyframes[k].forget_image();
+            kept -= 1;
+        }
+    }
+
+    /// Whether, and by what, Gaussians are scored: for control of their density, or to know which to give up.
+    fn scoring(&self) -> Option<WrongPixels> {
+        let wanted = self.config.density.strategy != DensityStrategy::None || self.config.limits.limits_gaussians();
+        wanted.then(|| self.config.density.wrong_pixels())
     }
 
     /// Removes and divides Gaussians by the scores of the last steps; returns how many fewer and how many more there are for it.
@@ -141,7 +174,7 @@ impl Mapper {
         if self.cloud.is_empty() {
             return Ok((0, 0));
         }
-        let scores = match self.config.density.scored() {
+        let scores = match self.scoring() {
             Some(_) => self.optimiser.read_scores(&self.gpu, &self.cloud)?,
             None => vec![GaussianScore::default(); self.cloud.len()],
         };
@@ -154,7 +187,7 @@ impl Mapper {
             Candidate { mean, raw_opacity, log_scale, rotation, score: scores[i], entry: self.ledger.entries()[i] }
         };
         let candidates: Vec<Candidate> = (0..self.cloud.len()).map(candidate).collect();
-        let plan = density::plan(&candidates, &self.config.density);
+        let plan = density::plan(&candidates, self.most_gaussians(), &self.config.density);
         let (before, children) = (self.cloud.len(), plan.children.len());
         let geometry = |c: &density::Child| [c.mean.extend(c.raw_opacity).into(), c.log_scale.extend(0.0).into()];
         let parents: Vec<u32> = plan.children.iter().map(|c| c.parent).collect();
@@ -191,16 +224,20 @@ impl Mapper {
 
     /// A last step of each of some keyframes of the window, evenly spread over it, that scores the Gaussians; returns their number.
     fn score(&mut self, window: &[usize]) -> Result<usize, MappingError> {
-        let Some(wrong) = self.config.density.scored() else { return Ok(0) };
+        let Some(wrong) = self.scoring() else { return Ok(0) };
         self.optimiser.begin_scores(&self.gpu, &self.cloud)?;
         let views = self.config.density.views.min(window.len());
-        let chosen: Vec<Step> =
-            (0..views).map(|k| Step { keyframe: window[k * window.len() / views], coarse: false, pace: self.config.window.last_pace }).collect();
+        let chosen: Vec<Step> = (0..views)
+            .map(|k| Step { keyframe: window[k * window.len() / views], coarse: false, pace: self.config.window.last_pace })
+            .collect();
         Ok(self.steps(&chosen, Some(wrong))?.len())
     }
 
     fn steps(&mut self, batch: &[Step], scored: Option<WrongPixels>) -> Result<Vec<StepReport>, MappingError> {
-        let views: Vec<TrainingView<'_>> = batch.iter().map(|step| self.keyframes[step.keyframe].view(step.coarse, step.pace, scored)).collect();
+        let view = |step: &Step| {
+            self.keyframes[step.keyframe].view(step.coarse, step.pace, scored).expect("only keyframes with images are drawn")
+        };
+        let views: Vec<TrainingView<'_>> = batch.iter().map(view).collect();
         let started = Instant::now();
         let reports = self.optimiser.steps(&mut self.rasterizer, &self.cloud, &views, (&self.config.loss, &self.config.adam))?;
         self.step_times.extend(std::iter::repeat_n(started.elapsed() / batch.len().max(1) as u32, batch.len()));

@@ -10,7 +10,8 @@ use crate::render::layout::AdamSetup;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct AdamConfig {
-    /// Position, metres a step.
+    /// Position, in units of the Gaussian's own size (geometric mean of its standard deviations) a step: fine ones move finely, and the
+    /// result does not depend on the unit of length.
     pub position_rate: f32,
     /// Raw opacity (logit) a step.
     pub opacity_rate: f32,
@@ -33,7 +34,7 @@ pub struct AdamConfig {
 impl Default for AdamConfig {
     fn default() -> Self {
         Self {
-            position_rate: 8e-4,
+            position_rate: 0.08,
             opacity_rate: 1e-1,
             scale_rate: 2e-2,
             rotation_rate: 4e-3,

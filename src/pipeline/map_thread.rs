@@ -35,7 +35,8 @@ pub(super) fn map(gpu: &Arc<Gpu>, config: &MappingConfig, messages: &Receiver<Ma
                 Ok(if moved > 0 { Some((None, Arc::new(mapper.download()?))) } else { None })
             }
             MapperMessage::Keyframe(keyframe) => {
-                let report = mapper.insert(&keyframe, &|| progress.stopped())?;
+                let stop = || progress.stopped() || (config.yields_to_keyframes && !messages.is_empty());
+                let report = mapper.insert(&keyframe, &stop)?;
                 Ok(Some((Some(report), Arc::new(mapper.download()?))))
             }
         });

@@ -7,6 +7,7 @@ pub mod project_backward;
 pub mod project_forward;
 pub mod rasterize_backward;
 pub mod rasterize_forward;
+pub mod scores;
 pub mod spherical_harmonics;
 
 use nalgebra::{Vector2, Vector3, Vector4};

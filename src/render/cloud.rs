@@ -18,6 +18,8 @@ pub struct GpuCloud {
     sh_degree: ShDegree,
     count: usize,
     capacity: usize,
+    /// The most that there may be, if that is limited.
+    limit: Option<usize>,
     parameters: GpuBuffer,
     moments_1: GpuBuffer,
     moments_2: GpuBuffer,
@@ -30,7 +32,7 @@ impl GpuCloud {
         let capacity = capacity.max(256);
         let [parameters, moments_1, moments_2] = allocate(gpu, sh_degree, capacity)?;
         let gather = Kernel::new(gpu, "gather", "main", &shaders::GATHER.text(BlendForm::default()));
-        Ok(Self { sh_degree, count: 0, capacity, parameters, moments_1, moments_2, gather })
+        Ok(Self { sh_degree, count: 0, capacity, limit: None, parameters, moments_1, moments_2, gather })
     }
 
     pub fn len(&self) -> usize {
@@ -47,6 +49,16 @@ impl GpuCloud {
 
     pub fn sh_degree(&self) -> ShDegree {
         self.sh_degree
+    }
+
+    /// Bytes of each Gaussian: parameters and two moments.
+    pub fn bytes_each(&self) -> u64 {
+        self.planes() as u64 * 48
+    }
+
+    /// Buffers are made for at most `limit` Gaussians from now on; whoever appends must keep to it.
+    pub fn limit(&mut self, limit: usize) {
+        self.limit = Some(limit);
     }
 
     /// Number of vec4 planes in each buffer.
@@ -102,14 +114,15 @@ impl GpuCloud {
         Ok(())
     }
 
-    /// Room for `needed` Gaussians: the present one, or twice as much as that or what the adapter can bind; if that is too little, the
-    /// allocation says how much is needed.
+    /// Room for `needed` Gaussians: the present one, or twice as much within the limit and what the adapter can bind; if that is too
+    /// little, the allocation says how much is needed.
     fn capacity_for(&self, gpu: &Gpu, needed: usize) -> usize {
+        let limit = self.limit.unwrap_or(usize::MAX).max(needed);
         if needed <= self.capacity {
-            return self.capacity;
+            return self.capacity.min(limit).max(needed);
         }
         let most = gpu.max_storage_bytes() as usize / (self.planes() * 16);
-        needed.next_power_of_two().min(most).max(needed)
+        needed.next_power_of_two().min(limit).min(most).max(needed)
     }
 
     /// Moves runs of Gaussians rigidly (new_from_old, in the world) and forgets their moments, which belong to where they were. On the

@@ -50,6 +50,14 @@ impl GaussianCloud {
         self.means.is_empty()
     }
 
+    /// At most `count` of its Gaussians, spread evenly over it.
+    pub fn thinned(&self, count: usize) -> Self {
+        let mut cloud = Self::new(self.sh_degree);
+        let count = count.min(self.len());
+        (0..count).for_each(|i| cloud.push(self.get(i * self.len() / count)));
+        cloud
+    }
+
     /// Appends a Gaussian; missing coefficients are zero, superfluous ones are dropped.
     pub fn push(&mut self, gaussian: Gaussian) {
         self.means.push(gaussian.mean);

@@ -68,14 +68,15 @@ impl Candidate {
     }
 }
 
-/// Judges every Gaussian; those gone bad (NaN) are removed whatever the strategy.
-pub(super) fn plan(candidates: &[Candidate], config: &DensityConfig) -> Plan {
+/// Judges every Gaussian; those gone bad (NaN) are removed whatever the strategy. At most `most` are left, undivided ones first.
+pub(super) fn plan(candidates: &[Candidate], most: usize, config: &DensityConfig) -> Plan {
     let verdicts = match config.strategy {
         DensityStrategy::Vcd => vcd::judge(candidates, &config.vcd),
         DensityStrategy::Classic => classic::judge(candidates, &config.classic),
         DensityStrategy::None => vec![Verdict::Keep; candidates.len()],
     };
     let mut plan = Plan::default();
+    let mut room = most.saturating_sub(candidates.len());
     for (i, (candidate, verdict)) in (0..).zip(candidates.iter().zip(verdicts)) {
         let worth = candidate.is_finite()
             && candidate.opacity() >= config.min_opacity
@@ -83,8 +84,11 @@ pub(super) fn plan(candidates: &[Candidate], config: &DensityConfig) -> Plan {
         match verdict {
             _ if !worth => {}
             Verdict::Remove => {}
-            Verdict::Keep => plan.keep.push(i),
-            Verdict::Split | Verdict::Clone => plan.children.extend(divide(i, candidate, verdict == Verdict::Clone)),
+            Verdict::Split | Verdict::Clone if room > 0 => {
+                plan.children.extend(divide(i, candidate, verdict == Verdict::Clone));
+                room -= 1;
+            }
+            Verdict::Keep | Verdict::Split | Verdict::Clone => plan.keep.push(i),
         }
     }
     plan
@@ -107,4 +111,78 @@ fn divide(parent: u32, of: &Candidate, clone: bool) -> [Child; 2] {
     };
     let raw_opacity = raw_opacity_from_opacity(opacity);
     [-apart, apart].map(|side| Child { parent, mean: of.mean + side * axis, raw_opacity, log_scale })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A disc of 10 cm by 2 cm a metre away, well seen and well placed.
+    fn good() -> Candidate {
+        Candidate {
+            mean: Vec3::new(0.0, 0.0, 1.0),
+            raw_opacity: raw_opacity_from_opacity(0.6),
+            log_scale: Vec3::new(0.02, 0.1, 0.01).map(f32::ln),
+            rotation: Quat::from_rotation_z(std::f32::consts::FRAC_PI_2),
+            score: GaussianScore {
+                weight_sum: 80.0,
+                weight_max: 0.5,
+                views: 4.0,
+                metres_per_pixel: 0.005,
+                ..GaussianScore::default()
+            },
+            entry: Entry { age: 5, views: 12, best_weight: 0.5, worth: 20.0, anchor: 0 },
+        }
+    }
+
+    fn wrong() -> Candidate {
+        let score = GaussianScore {
+            wrong_pixels: 80.0,
+            weighted_wrong_pixels: 8.0,
+            absolute_gradient: 0.1,
+            gradient: 0.05,
+            ..good().score
+        };
+        Candidate { score, ..good() }
+    }
+
+    #[test]
+    fn vcd_divides_what_several_views_call_too_coarse_and_nothing_else() {
+        let config = DensityConfig { vcd: VcdConfig { max_growth: 1.0, ..VcdConfig::default() }, ..DensityConfig::default() };
+        let fine = Candidate { log_scale: Vec3::splat(0.001f32.ln()), ..wrong() };
+        let young = Candidate { entry: Entry { age: 0, ..good().entry }, ..wrong() };
+        let unseen = Candidate { score: GaussianScore::default(), ..wrong() };
+        let plan = plan(&[good(), wrong(), fine, young, unseen], 100, &config);
+        assert_eq!(plan.keep, [0, 2, 3, 4]);
+        let [a, b] = &plan.children[..] else { panic!("{:?}", plan.children) };
+        assert_eq!((a.parent, b.parent), (1, 1));
+        // Along the long axis, which the rotation lays along -x.
+        assert!((a.mean - b.mean).length() > 0.1 && (a.mean - b.mean).y.abs() < 1e-6);
+        assert!((a.mean + b.mean - 2.0 * wrong().mean).length() < 1e-6 && a.log_scale.y < wrong().log_scale.y);
+    }
+
+    #[test]
+    fn what_is_never_seen_and_what_went_bad_goes() {
+        let config = DensityConfig::default();
+        let hidden = Candidate { entry: Entry { best_weight: 0.001, ..good().entry }, ..good() };
+        let new = Candidate { entry: Entry::default(), ..hidden };
+        let nan = Candidate { mean: Vec3::NAN, ..good() };
+        let faint = Candidate { raw_opacity: raw_opacity_from_opacity(0.01), ..good() };
+        let huge = Candidate { log_scale: Vec3::splat(2.0), ..good() };
+        let all = [good(), hidden, new, nan, faint, huge];
+        assert_eq!(plan(&all, 100, &config).keep, [0, 2]);
+        // Without control of density only what went bad goes.
+        let none = DensityConfig { strategy: DensityStrategy::None, ..config };
+        assert_eq!(plan(&all, 100, &none).keep, [0, 1, 2]);
+    }
+
+    #[test]
+    fn no_strategy_grows_a_map_beyond_its_room() {
+        for strategy in [DensityStrategy::Vcd, DensityStrategy::Classic] {
+            let vcd = VcdConfig { max_growth: 1.0, ..VcdConfig::default() };
+            let config = DensityConfig { strategy, vcd, ..DensityConfig::default() };
+            let plan = plan(&[wrong(); 10], 13, &config);
+            assert_eq!((plan.keep.len(), plan.children.len()), (7, 6));
+        }
+    }
 }

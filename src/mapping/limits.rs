@@ -1,0 +1,126 @@
+//! Holding the map within bounds on a recording of any length: how many Gaussians there may be, which go when others need their place, and
+//! which keyframes give their images back.
+
+use serde::{Deserialize, Serialize};
+
+use super::keyframe::MappedKeyframe;
+use super::ledger::Entry;
+
+/// Bytes that the rasterizer's scratch and the scores take for each Gaussian.
+const SCRATCH_BYTES_EACH: u64 = 112;
+/// Share of the memory that keyframes' images may take.
+const IMAGES_SHARE: f64 = 0.4;
+/// At least this many Gaussians are always allowed: less is no map.
+const LEAST_GAUSSIANS: usize = 1000;
+const LEAST_KEYFRAMES: usize = 8;
+/// Seeds of one keyframe may take at most this share of all places.
+const SEEDS_SHARE: f64 = 0.5;
+
+/// What the mapper may use.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct LimitsConfig {
+    /// Most Gaussians at any time.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub max_gaussians: Option<usize>,
+    /// Most bytes of GPU memory, as well as it can be foreseen.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub max_gpu_bytes: Option<u64>,
+    /// Keyframes whose images are kept to learn from.
+    pub max_keyframes: usize,
+}
+
+impl Default for LimitsConfig {
+    fn default() -> Self {
+        Self { max_gaussians: None, max_gpu_bytes: None, max_keyframes: 400 }
+    }
+}
+
+impl LimitsConfig {
+    /// Whether the number of Gaussians is limited at all.
+    pub(super) fn limits_gaussians(&self) -> bool {
+        self.max_gaussians.is_some() || self.max_gpu_bytes.is_some()
+    }
+
+    /// The most Gaussians, of `bytes_each` in the map, when buffers that don't depend on their number take `other_bytes`. A map is copied
+    /// when it changes, so its bytes count twice.
+    pub(super) fn gaussians(&self, bytes_each: u64, other_bytes: u64) -> usize {
+        let by_memory = self
+            .max_gpu_bytes
+            .map_or(usize::MAX, |limit| (limit.saturating_sub(other_bytes) / (2 * bytes_each + SCRATCH_BYTES_EACH)) as usize);
+        self.max_gaussians.unwrap_or(usize::MAX).min(by_memory).max(LEAST_GAUSSIANS)
+    }
+
+    /// Bytes of `bytes` in use that don't depend on the number of Gaussians, when there is room for `capacity`.
+    pub(super) fn other_bytes(bytes: u64, bytes_each: u64, capacity: usize) -> u64 {
+        bytes.saturating_sub(capacity as u64 * (bytes_each + SCRATCH_BYTES_EACH))
+    }
+
+    /// The most keyframes with images of `image_bytes` each.
+    pub(super) fn keyframes(&self, image_bytes: u64) -> usize {
+        let by_memory =
+            self.max_gpu_bytes.map_or(usize::MAX, |limit| (IMAGES_SHARE * limit as f64) as usize / image_bytes.max(1) as usize);
+        self.max_keyframes.min(by_memory).max(LEAST_KEYFRAMES)
+    }
+
+    /// Says what is wrong with the values, if anything.
+    pub fn validate(&self) -> Result<(), String> {
+        if self.max_gaussians.is_some_and(|n| n < LEAST_GAUSSIANS) {
+            return Err(format!("max_gaussians must be at least {LEAST_GAUSSIANS}"));
+        }
+        if self.max_keyframes < LEAST_KEYFRAMES {
+            return Err(format!("max_keyframes must be at least {LEAST_KEYFRAMES}"));
+        }
+        Ok(())
+    }
+}
+
+/// How many of `seeds` may come into a map of at most `most` Gaussians.
+pub(super) fn seeds_allowed(seeds: usize, most: usize) -> usize {
+    seeds.min((SEEDS_SHARE * most as f64) as usize)
+}
+
+/// The Gaussians to keep so that at most `most` are left: the least useful go, the older first among equals. Ascending.
+pub(super) fn most_useful(entries: &[Entry], most: usize) -> Vec<u32> {
+    let mut ranked: Vec<u32> = (0..entries.len() as u32).collect();
+    ranked.sort_by(|a, b| entries[*b as usize].worth.total_cmp(&entries[*a as usize].worth).then(b.cmp(a)));
+    ranked.truncate(most);
+    ranked.sort_unstable();
+    ranked
+}
+
+/// The keyframe whose image is missed least: of those that still have one and are not among the `recent` newest, the one between the two
+/// nearest neighbours in time. The first stays, it holds the world.
+pub(super) fn least_missed(keyframes: &[MappedKeyframe], recent: usize) -> Option<usize> {
+    let with_image: Vec<usize> = (0..keyframes.len().saturating_sub(recent)).filter(|&k| keyframes[k].has_image()).collect();
+    // Radians and metres weigh alike: at a metre's distance they move the image alike.
+    let apart = |a: usize, b: usize| {
+        let b_from_a = keyframes[b].camera.camera_from_world * keyframes[a].camera.camera_from_world.inverse();
+        b_from_a.translation.vector.norm() + b_from_a.rotation.angle()
+    };
+    let detour = |w: &[usize]| apart(w[0], w[1]) + apart(w[1], w[2]);
+    with_image.windows(3).min_by(|a, b| detour(a).total_cmp(&detour(b))).map(|w| w[1])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_least_useful_go_first() {
+        let entries = [0.3, 0.0, 2.0, 0.0, 0.1].map(|worth| Entry { worth, ..Entry::default() });
+        assert_eq!(most_useful(&entries, 4), [0, 2, 3, 4]);
+        assert_eq!(most_useful(&entries, 2), [0, 2]);
+        assert_eq!(most_useful(&entries, 9), [0, 1, 2, 3, 4]);
+    }
+
+    #[test]
+    fn memory_is_shared_by_images_and_gaussians() {
+        let limits = LimitsConfig { max_gpu_bytes: Some(100_000_000), ..LimitsConfig::default() };
+        assert_eq!(limits.keyframes(1_000_000), 40);
+        let most = limits.gaussians(336, 40_000_000);
+        assert!((76_000..77_000).contains(&most), "{most}");
+        assert_eq!(LimitsConfig { max_gaussians: Some(5000), ..limits }.gaussians(336, 0), 5000);
+        assert!(LimitsConfig { max_gaussians: Some(5), ..LimitsConfig::default() }.validate().is_err());
+    }
+}

@@ -1,0 +1,87 @@
+//! What a run may spend, in a word: presets of the configuration, and for real time a resolution that the adapter can afford.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use serde::{Deserialize, Serialize};
+
+use crate::bench::{BenchScene, StepRunner};
+use crate::config::{Config, ConfigError};
+use crate::gpu::{Gpu, GpuError};
+use crate::render::BlendForm;
+use crate::sequence::Sequence;
+
+/// How much time a run may take.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Budget {
+    /// Keeps up with frames that arrive by their timestamps.
+    Realtime,
+    /// The defaults.
+    Balanced,
+    /// More steps and finer seeds.
+    Quality,
+}
+
+/// Shares of the recorded resolution that real time may choose.
+const SCALES: [f64; 6] = [1.0, 0.75, 0.5, 0.375, 0.25, 0.125];
+/// A step should take no longer: some ten of them fit between two keyframes of a walking camera.
+const STEP: Duration = Duration::from_millis(25);
+/// One Gaussian in view per this many pixels, as seeding gives them.
+const PIXELS_EACH: u32 = 8;
+/// Neither side is made smaller than this.
+const LEAST_PIXELS: u32 = 96;
+
+impl Budget {
+    /// Settings in which the budget differs from the defaults.
+    pub fn settings(self) -> &'static [&'static str] {
+        match self {
+            Self::Realtime => &[
+                "replay.paced=true",
+                "mapping.yields_to_keyframes=true",
+                "mapping.first_iterations=10",
+                "mapping.iterations_per_keyframe=200",
+                "mapping.seeding.stride=2",
+                "mapping.seeding.flat_stride=8",
+                "mapping.window.recent=4",
+                "mapping.window.covisible=2",
+            ],
+            Self::Balanced => &[],
+            Self::Quality => {
+                &["mapping.iterations_per_keyframe=120", "mapping.seeding.stride=2", "mapping.seeding.flat_stride=4"]
+            }
+        }
+    }
+
+    /// The configuration with this budget's settings.
+    ///
+    /// # Errors
+    /// If they contradict what is set already.
+    pub fn apply(self, config: &Config) -> Result<Config, ConfigError> {
+        config.with_settings(self.settings())
+    }
+}
+
+/// The largest share of the recorded resolution at which a training step is quick enough for real time, measured on a scene of about
+/// the size that a view will have.
+///
+/// # Errors
+/// If the adapter fails.
+pub fn realtime_scale(gpu: &Arc<Gpu>, sequence: &Sequence, config: &Config) -> Result<f64, GpuError> {
+    let mut chosen = 1.0;
+    for scale in SCALES {
+        let pinhole = sequence.camera.pinhole.scaled(scale);
+        if scale < 1.0 && pinhole.width.min(pinhole.height) < LEAST_PIXELS {
+            break;
+        }
+        chosen = scale;
+        let size = (pinhole.width, pinhole.height);
+        let scene = BenchScene::new(gpu, (size.0 * size.1 / PIXELS_EACH) as usize, size, config.mapping.sh_degree)?;
+        let wall = StepRunner::new(gpu, scene, BlendForm::of(gpu))?.run()?.wall;
+        tracing::info!(scale, step_ms = wall.as_secs_f64() * 1e3, "measured a training step");
+        if wall <= STEP {
+            break;
+        }
+    }
+    Ok(chosen)
+}
