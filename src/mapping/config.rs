@@ -32,7 +32,7 @@ pub struct MappingConfig {
 impl Default for MappingConfig {
     fn default() -> Self {
         Self {
-            sh_degree: ShDegree::new(1).expect("degrees 0 to 3 exist"),
+            sh_degree: ShDegree::new(2).expect("degrees 0 to 3 exist"),
             iterations_per_keyframe: 50,
             first_iterations: 100,
             yields_to_keyframes: false,
@@ -83,7 +83,7 @@ pub struct SkipConfig {
 
 impl Default for SkipConfig {
     fn default() -> Self {
-        Self { draw_by_loss: true, coarse_share: 0.0, min_gain: 0.0 }
+        Self { draw_by_loss: true, coarse_share: 0.0, min_gain: 0.01 }
     }
 }
 

@@ -39,7 +39,7 @@ impl Default for AdamConfig {
             scale_rate: 2e-2,
             rotation_rate: 4e-3,
             color_rate: 2e-2,
-            harmonics_rate: 4e-3,
+            harmonics_rate: 1e-2,
             harmonics_every: 1,
             beta_1: 0.9,
             beta_2: 0.999,
