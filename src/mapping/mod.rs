@@ -1,14 +1,16 @@
 //! The mapping thread's work: keyframes in, Gaussians seeded, optimised over a sliding window and pruned, snapshots out.
-//! Knows nothing of tracking; poses and covisibility arrive with the keyframes.
+//! A refinement over all keyframes may follow. Knows nothing of tracking; poses and covisibility arrive with the keyframes.
 
 mod config;
 mod density;
 mod keyframe;
 mod ledger;
 mod mapper;
+mod neighbours;
+mod points;
 mod seeding;
 
-pub use config::{MappingConfig, SeedingConfig, WindowConfig};
+pub use config::{MappingConfig, PointsConfig, RefineConfig, SeedingConfig, WindowConfig};
 pub use density::{ClassicConfig, DensityConfig, DensityStrategy, VcdConfig};
 pub use keyframe::{Keyframe, KeyframeId};
-pub use mapper::{KeyframeReport, Mapper, MappingError};
+pub use mapper::{KeyframeReport, Mapper, MappingError, RefineReport, Refinement};

@@ -1,6 +1,7 @@
 //! What a view should look like, and the weights of the loss.
 
-use image::RgbImage;
+use image::imageops::{FilterType, resize};
+use image::{ImageBuffer, Luma, RgbImage};
 use serde::{Deserialize, Serialize};
 
 use crate::gpu::{Gpu, GpuBuffer, GpuError};
@@ -90,5 +91,22 @@ impl TargetImage {
             depth.write(gpu, 0, metres);
         }
         Ok(Self { width, height, color, depth })
+    }
+
+    /// The image at half its size, as [`Pinhole::scaled`](crate::geometry::Pinhole::scaled) rounds it: colour averaged, depth of the
+    /// nearest pixel.
+    pub fn halved(&self, gpu: &Gpu) -> Result<Self, GpuError> {
+        let half = |side: u32| (f64::from(side) * 0.5).round().max(1.0) as u32;
+        let (width, height) = (half(self.width), half(self.height));
+        let pixels = (self.width * self.height) as usize;
+        let color: Vec<u32> = self.color.read(gpu, 0, pixels)?;
+        let color = color.into_iter().flat_map(|packed| packed.to_le_bytes().into_iter().take(3)).collect();
+        let of_size = "as many pixels as the image has";
+        let color = RgbImage::from_raw(self.width, self.height, color).expect(of_size);
+        let depth: Vec<f32> = self.depth.read(gpu, 0, pixels)?;
+        let depth = ImageBuffer::<Luma<f32>, _>::from_raw(self.width, self.height, depth).expect(of_size);
+        let color = resize(&color, width, height, FilterType::Triangle);
+        let depth = resize(&depth, width, height, FilterType::Nearest);
+        Self::new(gpu, &color, Some(depth.as_raw()))
     }
 }
