@@ -119,7 +119,7 @@ pub struct PointsConfig {
 
 impl Default for PointsConfig {
     fn default() -> Self {
-        Self { spacing_pixels: 3.0, footprint: 0.7, opacity: 0.3, size_range: 8.0 }
+        Self { spacing_pixels: 8.0, footprint: 1.0, opacity: 0.3, size_range: 8.0 }
     }
 }
 

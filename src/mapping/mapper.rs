@@ -91,6 +91,9 @@ impl Mapper {
         self.keyframes.push(mapped);
         let first = self.keyframes.len() == 1;
         let iterations = if first { self.config.first_iterations } else { self.config.iterations_per_keyframe };
+        if iterations == 0 {
+            return Ok(KeyframeReport { id: keyframe.id, seeded, gaussians: self.cloud.len(), ..KeyframeReport::default() });
+        }
         let (done, psnr_db) = self.optimise(iterations, stop)?;
         let (pruned, grown) = self.control_density()?;
         Ok(KeyframeReport { id: keyframe.id, seeded, pruned, grown, gaussians: self.cloud.len(), iterations: done, psnr_db })

@@ -1,6 +1,7 @@
 //! Moving the map towards the keyframes: the image loss, its gradient, and Adam, all on the GPU.
 
 mod adam;
+mod kernels;
 mod loss;
 mod optimiser;
 mod scores;

@@ -4,11 +4,12 @@ use std::time::{Duration, Instant};
 
 use bytemuck::{Pod, Zeroable};
 
+use super::kernels::Kernels;
 use super::scores::{GaussianScore, Scores, WrongPixels};
 use super::{AdamConfig, LossConfig, LossTerms, TargetImage};
-use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, workgroups};
+use crate::gpu::{Gpu, GpuBuffer, GpuError, workgroups};
 use crate::render::layout::{AdamSetup, COUNTERS, Counter, LossSetup, VISIBLE_COUNTER, View};
-use crate::render::{BlendForm, GpuCloud, PreparedView, Rasterizer, ViewCounts, cloud_from_planes, shaders};
+use crate::render::{GpuCloud, PreparedView, Rasterizer, ViewCounts, cloud_from_planes};
 use crate::splat::{GaussianCloud, ViewCamera};
 
 const LOSS_TILE: u32 = 16;
@@ -67,17 +68,6 @@ enum Sink<'a> {
     Gradient(&'a GpuBuffer),
 }
 
-#[derive(Debug)]
-struct Kernels {
-    loss_forward: Kernel,
-    loss_reduce: Kernel,
-    loss_backward: Kernel,
-    rasterize_backward: Kernel,
-    project_backward: Kernel,
-    project_backward_adam: Kernel,
-    pose_reduce: Kernel,
-}
-
 /// The training step with its scratch buffers.
 #[derive(Debug)]
 pub struct Optimiser {
@@ -91,6 +81,8 @@ pub struct Optimiser {
     /// Width and height that the buffers per pixel are for.
     size: (u32, u32),
     gaussians: usize,
+    /// The step's target, copied to one place: bind groups over each view's own buffers would be made anew all the time.
+    target: TargetImage,
     partials: GpuBuffer,
     image_gradients: GpuBuffer,
     loss_sums: GpuBuffer,
@@ -105,20 +97,8 @@ impl Optimiser {
 
     /// For the views that `rasterizer` renders: both passes of the blending take the same form.
     pub fn new(rasterizer: &Rasterizer) -> Result<Self, GpuError> {
-        let (gpu, form) = (rasterizer.gpu(), rasterizer.form());
-        let kernel = |source: &shaders::ShaderSource| Kernel::new(gpu, source.name, "main", &source.text(form));
-        let kernels = Kernels {
-            loss_forward: kernel(&shaders::LOSS_FORWARD),
-            loss_reduce: kernel(&shaders::LOSS_REDUCE),
-            loss_backward: kernel(&shaders::LOSS_BACKWARD),
-            rasterize_backward: kernel(match form {
-                BlendForm::Wide => &shaders::RASTERIZE_BACKWARD_SPLATS,
-                BlendForm::Narrow => &shaders::RASTERIZE_BACKWARD_PIXELS,
-            }),
-            project_backward: kernel(&shaders::PROJECT_BACKWARD),
-            project_backward_adam: kernel(&shaders::PROJECT_BACKWARD_ADAM),
-            pose_reduce: kernel(&shaders::POSE_REDUCE),
-        };
+        let gpu = rasterizer.gpu();
+        let kernels = Kernels::new(rasterizer);
         gpu.check()?;
         let empty = |label: &str| GpuBuffer::storage(gpu, label, 16);
         Ok(Self {
@@ -130,6 +110,7 @@ impl Optimiser {
             loss_setup: GpuBuffer::uniform(gpu, "loss setup", &LossSetup::zeroed())?,
             size: (0, 0),
             gaussians: 0,
+            target: TargetImage::blank(gpu, (1, 1))?,
             partials: empty("loss partials")?,
             image_gradients: empty("image gradients")?,
             loss_sums: empty("loss sums")?,
@@ -294,13 +275,16 @@ impl Optimiser {
         let prepared = rasterizer.prepare(cloud, camera, background)?;
         self.reserve(&gpu, &prepared.view, cloud)?;
         rasterizer.encode_clear(encoder);
+        if let Objective::Image(target, ..) = objective {
+            self.target.encode_copy(encoder, target);
+        }
         if let Sink::Gradient(buffer) = sink {
             encoder.clear_buffer(buffer.raw(), 0, None);
         }
         let mut pass = encoder.begin_compute_pass(&Default::default());
         rasterizer.encode_forward(&mut pass, cloud, &prepared);
-        if let Objective::Image(target, loss, scored) = objective {
-            self.encode_loss(&mut pass, rasterizer, target, loss);
+        if let Objective::Image(_, loss, scored) = objective {
+            self.encode_loss(&mut pass, rasterizer, loss);
             let image = (&self.image_gradients, &self.loss_total);
             scored.iter().for_each(|wrong| self.scores.encode(&mut pass, rasterizer, &prepared, image, (wrong, loss)));
         }
@@ -309,9 +293,10 @@ impl Optimiser {
         Ok(())
     }
 
-    fn encode_loss(&self, pass: &mut wgpu::ComputePass<'_>, rasterizer: &Rasterizer, target: &TargetImage, loss: &LossConfig) {
+    fn encode_loss(&self, pass: &mut wgpu::ComputePass<'_>, rasterizer: &Rasterizer, loss: &LossConfig) {
         let (gpu, ws, k) = (rasterizer.gpu(), &rasterizer.workspace, &self.kernels);
-        let (width, height) = (target.width, target.height);
+        let TargetImage { width, height, color, depth } = &self.target;
+        let (width, height) = (*width, *height);
         let setup = LossSetup { width, height, ssim_weight: loss.ssim_weight, depth_weight: loss.depth_weight };
         self.loss_setup.write(gpu, 0, &[setup]);
         let forward = [width.div_ceil(LOSS_TILE), height.div_ceil(LOSS_TILE / 2), 1];
@@ -320,8 +305,8 @@ impl Optimiser {
             (0, &self.loss_setup),
             (1, &ws.color_depth),
             (2, &ws.state),
-            (3, &target.color),
-            (4, &target.depth),
+            (3, color),
+            (4, depth),
             (5, &self.partials),
         ];
         let with = |last| inputs.iter().copied().chain([last]).collect::<Vec<_>>();
@@ -386,6 +371,7 @@ impl Optimiser {
             let pixels = u64::from(view.pixels());
             let blocks = u64::from(view.width.div_ceil(LOSS_TILE) * view.height.div_ceil(LOSS_TILE / 2));
             let bordered = u64::from(bordered(view.width)) * u64::from(bordered(view.height));
+            self.target = TargetImage::blank(gpu, (view.width, view.height))?;
             self.partials = GpuBuffer::storage(gpu, "loss partials", bordered * 48)?;
             self.image_gradients = GpuBuffer::storage(gpu, "image gradients", pixels * 32)?;
             // Its length is the number of terms that are summed.

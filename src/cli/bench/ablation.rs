@@ -96,6 +96,7 @@ pub(super) fn ablation(args: &AblationArgs) -> miette::Result<()> {
             row(&mapped)?;
         }
     }
+    std::fs::create_dir_all(&args.run.out).into_diagnostic()?;
     let text = serde_json::to_string_pretty(&rows).into_diagnostic()?;
     keysplat::export::write_atomically(&args.run.out.join("ablation.json"), text.as_bytes()).into_diagnostic()?;
     Ok(())
