@@ -140,7 +140,7 @@ fn point_gradient(projection: Projection, by_mean_2d: vec2<f32>, by_depth: f32, 
 
 // Stores the coefficients' gradients; returns the mean's gradient through the view direction, world frame.
 fn color_gradient(i: u32, mean: vec3<f32>, by_color: vec3<f32>) -> vec3<f32> {
-    let coefficients = (view.sh_degree + 1u) * (view.sh_degree + 1u);
+    let coefficients = coefficient_count(view, arrayLength(&parameters));
     let offset = mean - view.center_in_world.xyz;
     let distance = length(offset);
     let direction = offset / distance;

@@ -68,9 +68,9 @@ fn project(i: u32) -> bool {
 
 fn color(i: u32, mean: vec3<f32>) -> vec3<f32> {
     var sum = vec3(0.5) + 0.28209479 * parameters[3u * view.capacity + i].xyz;
-    if view.sh_degree > 0u {
+    let coefficients = coefficient_count(view, arrayLength(&parameters));
+    if coefficients > 1u {
         let direction = normalize(mean - view.center_in_world.xyz);
-        let coefficients = (view.sh_degree + 1u) * (view.sh_degree + 1u);
         for (var k = 1u; k < coefficients; k++) {
             sum += sh_basis(k, direction) * parameters[(3u + k) * view.capacity + i].xyz;
         }

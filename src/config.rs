@@ -53,6 +53,8 @@ pub struct ReplayConfig {
     pub frames: Option<(usize, usize)>,
     /// Frames arrive by their timestamps; what comes too late is counted. Otherwise nothing is dropped and a run repeats to the bit.
     pub paced: bool,
+    /// Nothing is tracked: poses are those that the recording knows (COLMAP, transforms.json, ground truth).
+    pub known_poses: bool,
     /// Every n-th frame is never given to the mapper and measures the map; 0 holds none out.
     pub held_out_every: usize,
 }
@@ -72,7 +74,7 @@ impl Default for Config {
 
 impl Default for ReplayConfig {
     fn default() -> Self {
-        Self { every: 1, frames: None, paced: false, held_out_every: 8 }
+        Self { every: 1, frames: None, paced: false, known_poses: false, held_out_every: 8 }
     }
 }
 
@@ -95,12 +97,37 @@ pub enum ConfigError {
     In { path: PathBuf, source: Box<ConfigError> },
 }
 
+/// Puts the values of `over` in the place of those of `under`, table by table.
+fn overlay(under: &mut toml::Table, over: toml::Table) {
+    for (key, value) in over {
+        match (under.get_mut(&key), value) {
+            (Some(toml::Value::Table(under)), toml::Value::Table(over)) => overlay(under, over),
+            (_, value) => {
+                under.insert(key, value);
+            }
+        }
+    }
+}
+
 impl Config {
-    /// Reads and checks a TOML file; keys that it leaves out keep their defaults, unknown ones are errors.
-    pub fn read(path: &Path) -> Result<Self, ConfigError> {
+    /// The defaults for recordings whose poses are known.
+    pub fn offline() -> Self {
+        let replay = ReplayConfig { known_poses: true, ..ReplayConfig::default() };
+        Self { replay, mapping: MappingConfig::offline(), ..Self::default() }
+    }
+
+    /// Reads and checks a TOML file; keys that it leaves out keep their defaults, unknown ones are errors. The defaults are those of
+    /// [`Self::offline`] if `known_poses`, or the file, says so.
+    pub fn read(path: &Path, known_poses: bool) -> Result<Self, ConfigError> {
         let text = std::fs::read_to_string(path).map_err(|source| ConfigError::Read { path: path.into(), source })?;
-        let config: Self =
-            toml::from_str(&text).map_err(|source| ConfigError::Syntax { path: path.into(), source: Box::new(source) })?;
+        let syntax = |source| ConfigError::Syntax { path: path.into(), source: Box::new(source) };
+        let mut config: Self = toml::from_str(&text).map_err(syntax)?;
+        if known_poses || config.replay.known_poses {
+            let mut table = toml::Table::try_from(Self::offline()).expect("a configuration is plain data");
+            overlay(&mut table, toml::from_str(&text).map_err(syntax)?);
+            config = table.try_into().map_err(syntax)?;
+            config.replay.known_poses = true;
+        }
         config.validate().map_err(|source| ConfigError::In { path: path.into(), source: Box::new(source) })?;
         Ok(config)
     }
@@ -172,12 +199,25 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("run.toml");
         std::fs::write(&path, "map_scale = 0.5\n[mapping.loss]\nssim_wieght = 0.1\n").unwrap();
-        let message = Config::read(&path).unwrap_err().to_string();
+        let message = Config::read(&path, false).unwrap_err().to_string();
         assert!(message.contains("run.toml") && message.contains("line 3") && message.contains("ssim_wieght"), "{message}");
         let wrong = |text: &str| toml::from_str::<Config>(text).unwrap().validate().unwrap_err().to_string();
         assert!(wrong("map_scale = 2.0").contains("map_scale"));
         assert!(wrong("[mapping.seeding]\nstride = 0").contains("stride"));
         assert!(wrong("[mapping.adam]\nbeta_1 = 1.0").contains("beta_1"));
+    }
+
+    #[test]
+    fn a_file_goes_over_the_defaults_for_known_poses() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("run.toml");
+        std::fs::write(&path, "[mapping.refine]\ndensity_every = 70\n").unwrap();
+        let offline = Config::read(&path, true).unwrap();
+        assert_eq!((offline.mapping.refine.density_every, offline.replay.known_poses), (70, true));
+        assert_eq!(offline.mapping.refine.steps, MappingConfig::offline().refine.steps);
+        assert_eq!(Config::read(&path, false).unwrap().mapping.refine.steps, 0);
+        std::fs::write(&path, offline.to_toml()).unwrap();
+        assert_eq!(Config::read(&path, false).unwrap(), offline);
     }
 
     #[test]

@@ -40,3 +40,9 @@ fn rotate_to_world(view_: View, v: vec3<f32>) -> vec3<f32> {
 fn translation(view_: View) -> vec3<f32> {
     return vec3(view_.camera_row_0.w, view_.camera_row_1.w, view_.camera_row_2.w);
 }
+
+// Harmonics of a Gaussian whose parameters' planes hold so many vectors. The length never decides: it is there because Mesa's software
+// adapter compiles a shader anew in each step whose loops end at a uniform's value, and that costs more than the step.
+fn coefficient_count(view_: View, parameter_vectors: u32) -> u32 {
+    return min((view_.sh_degree + 1u) * (view_.sh_degree + 1u), parameter_vectors / view_.capacity);
+}

@@ -46,6 +46,10 @@ pub struct RunArgs {
     /// Let frames arrive by their timestamps and drop what comes too late.
     #[arg(long)]
     paced: bool,
+    /// Track nothing: take the poses that the recording knows (COLMAP, transforms.json, ground truth), and refine the map over all
+    /// keyframes after the last one.
+    #[arg(long)]
+    known_poses: bool,
     /// Part of the name of the adapter to use (see `keysplat adapters`).
     #[arg(long)]
     adapter: Option<String>,
@@ -112,7 +116,11 @@ fn parse_range(text: &str) -> Result<(usize, usize), String> {
 
 impl RunArgs {
     pub fn resolve(&self) -> miette::Result<Config> {
-        let mut config = self.config.as_deref().map_or_else(|| Ok(Config::default()), Config::read).into_diagnostic()?;
+        let mut config = match &self.config {
+            Some(path) => Config::read(path, self.known_poses).into_diagnostic()?,
+            None if self.known_poses => Config::offline(),
+            None => Config::default(),
+        };
         if let Some(budget) = self.budget {
             config = Budget::from(budget).apply(&config).into_diagnostic()?;
         }
@@ -169,6 +177,9 @@ pub fn open(config: &mut Config) -> miette::Result<Sequence> {
     sequence.select(range, config.replay.every).into_diagnostic()?;
     config.replay.frames = config.replay.frames.map(|(start, end)| (start, end.min(recorded)));
     pipeline::check_size(&sequence, config.map_scale).into_diagnostic()?;
+    if config.replay.known_poses {
+        pipeline::check_known_poses(&sequence).into_diagnostic()?;
+    }
     Ok(sequence)
 }
 
@@ -176,7 +187,9 @@ pub fn open(config: &mut Config) -> miette::Result<Sequence> {
 pub fn replay(mut config: Config, out: PathBuf, stop: Arc<AtomicBool>, verbosity: Verbosity) -> miette::Result<()> {
     let sequence = open(&mut config)?;
     let config = &config;
-    pipeline::check_first_depth(&sequence).into_diagnostic()?;
+    if !config.replay.known_poses {
+        pipeline::check_first_depth(&sequence).into_diagnostic()?;
+    }
     let gpu = Gpu::open(config.adapter.as_deref()).into_diagnostic()?;
     outputs::prepare_folder(&out).into_diagnostic()?;
     tracing::info!(

@@ -80,7 +80,7 @@ pub struct RelativeErrors {
 pub fn associate(truth: &Trajectory, estimate: &Trajectory, max_difference_s: f64) -> Vec<Pair> {
     let truth_is_shorter = truth.poses.len() < estimate.poses.len();
     let (shorter, longer) = if truth_is_shorter { (truth, estimate) } else { (estimate, truth) };
-    let partners = shorter.poses.iter().map(|pose| nearest(longer, pose.timestamp_s, max_difference_s));
+    let partners = shorter.poses.iter().map(|pose| longer.nearest(pose.timestamp_s, max_difference_s));
     partners
         .enumerate()
         .filter_map(|(i, partner)| {
@@ -88,16 +88,6 @@ pub fn associate(truth: &Trajectory, estimate: &Trajectory, max_difference_s: f6
             Some(Pair { truth, estimate })
         })
         .collect()
-}
-
-fn nearest(trajectory: &Trajectory, timestamp_s: f64, max_difference_s: f64) -> Option<usize> {
-    let poses = &trajectory.poses;
-    let after = poses.partition_point(|pose| pose.timestamp_s <= timestamp_s);
-    let distance = |i: usize| (poses[i].timestamp_s - timestamp_s).abs();
-    let candidates = [after.checked_sub(1), (after < poses.len()).then_some(after)];
-    // `min_by` keeps the first of equals: the earlier.
-    let best = candidates.into_iter().flatten().min_by(|&a, &b| distance(a).total_cmp(&distance(b)))?;
-    (distance(best) <= max_difference_s).then_some(best)
 }
 
 /// Aligns an estimate with the truth and measures it; stamps are associated within [`MAX_TIME_DIFFERENCE_S`].

@@ -76,6 +76,16 @@ impl Trajectory {
         Ok(Self { poses })
     }
 
+    /// The index of the pose nearest to a time, if within `max_difference_s`; of two equally near ones the earlier.
+    pub fn nearest(&self, timestamp_s: f64, max_difference_s: f64) -> Option<usize> {
+        let after = self.poses.partition_point(|pose| pose.timestamp_s <= timestamp_s);
+        let distance = |i: usize| (self.poses[i].timestamp_s - timestamp_s).abs();
+        let candidates = [after.checked_sub(1), (after < self.poses.len()).then_some(after)];
+        // `min_by` keeps the first of equals: the earlier.
+        let best = candidates.into_iter().flatten().min_by(|&a, &b| distance(a).total_cmp(&distance(b)))?;
+        (distance(best) <= max_difference_s).then_some(best)
+    }
+
     /// The TUM text of this trajectory. Nine decimals: far below any tracker's noise, and enough that a reader computes the
     /// same errors as we do.
     pub fn to_tum(&self) -> String {

@@ -24,6 +24,8 @@ pub struct MappingConfig {
     pub skip: SkipConfig,
     pub limits: LimitsConfig,
     pub seeding: SeedingConfig,
+    pub points: PointsConfig,
+    pub refine: RefineConfig,
     pub density: DensityConfig,
     pub loss: LossConfig,
     pub adam: AdamConfig,
@@ -41,6 +43,8 @@ impl Default for MappingConfig {
             skip: SkipConfig::default(),
             limits: LimitsConfig::default(),
             seeding: SeedingConfig::default(),
+            points: PointsConfig::default(),
+            refine: RefineConfig::default(),
             density: DensityConfig::default(),
             loss: LossConfig::default(),
             adam: AdamConfig::default(),
@@ -128,7 +132,83 @@ impl Default for SeedingConfig {
     }
 }
 
+/// How points of the scene that came with the recording become Gaussians.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct PointsConfig {
+    /// Of points nearer to one another than about so many pixels of the nearest view (at the mapping resolution), one is taken.
+    pub spacing_pixels: f32,
+    /// Standard deviation in units of the mean distance to the three nearest points.
+    pub footprint: f32,
+    pub opacity: f32,
+    /// No Gaussian is this many times smaller or larger than the median one.
+    pub size_range: f32,
+}
+
+impl Default for PointsConfig {
+    fn default() -> Self {
+        Self { spacing_pixels: 8.0, footprint: 1.0, opacity: 0.3, size_range: 8.0 }
+    }
+}
+
+/// The refinement over all keyframes after the last one.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RefineConfig {
+    /// Steps, one view each; 0 leaves the map as it is after the last keyframe.
+    pub steps: usize,
+    /// Density is controlled each time after so many steps,
+    pub density_every: usize,
+    /// by the scores of so many keyframes, evenly spread over all.
+    pub density_views: usize,
+    /// Share of the steps after which the map grows no more.
+    pub growth_share: f32,
+    /// Share of the steps, the first ones, that see the images at half size.
+    pub half_size_share: f32,
+    /// What the rates of positions, and all others, fall to in the end, as a share of what they are at first.
+    pub final_position_rate: f32,
+    pub final_rate: f32,
+}
+
+impl Default for RefineConfig {
+    fn default() -> Self {
+        Self {
+            steps: 0,
+            density_every: 200,
+            density_views: 10,
+            growth_share: 0.65,
+            half_size_share: 0.3,
+            final_position_rate: 0.02,
+            final_rate: 0.2,
+        }
+    }
+}
+
 impl MappingConfig {
+    /// For recordings whose poses are known: keyframes only arrive, and the refinement makes the map.
+    pub fn offline() -> Self {
+        let refine = RefineConfig { steps: 6000, ..RefineConfig::default() };
+        Self { iterations_per_keyframe: 0, first_iterations: 0, refine, ..Self::default() }
+    }
+
+    /// The same for a world whose unit is not the metre but `units_per_metre` to one: each length is given in that unit.
+    pub fn in_units(&self, units_per_metre: f32) -> Self {
+        let mut scaled = self.clone();
+        let lengths = [
+            &mut scaled.density.max_scale_metres,
+            &mut scaled.seeding.min_depth_metres,
+            &mut scaled.seeding.max_depth_metres,
+        ];
+        lengths.into_iter().for_each(|length| *length *= units_per_metre);
+        scaled.loss.depth_weight /= units_per_metre;
+        scaled
+    }
+
+    /// Whether any step may be taken at half the size.
+    pub fn learns_at_half_size(&self) -> bool {
+        self.skip.coarse_share > 0.0 || (self.refine.steps > 0 && self.refine.half_size_share > 0.0)
+    }
+
     /// Says what is wrong with the values, if anything.
     pub fn validate(&self) -> Result<(), String> {
         let s = &self.seeding;
@@ -141,11 +221,18 @@ impl MappingConfig {
             ("skip.min_gain", self.skip.min_gain),
             ("seeding.min_alpha", s.min_alpha),
             ("seeding.opacity", s.opacity),
+            ("points.opacity", self.points.opacity),
         ];
         if let Some((name, value)) = shares.iter().find(|(_, value)| !(0.0..1.0).contains(value)) {
             return Err(format!("mapping.{name} must lie between 0 and 1, not {value}"));
         }
         let positive = [
+            ("points.opacity", self.points.opacity),
+            ("points.spacing_pixels", self.points.spacing_pixels),
+            ("points.footprint", self.points.footprint),
+            ("points.size_range", self.points.size_range),
+            ("refine.final_position_rate", self.refine.final_position_rate),
+            ("refine.final_rate", self.refine.final_rate),
             ("seeding.depth_disagreement", s.depth_disagreement),
             ("seeding.footprint", s.footprint),
             ("seeding.thickness", s.thickness),
@@ -160,6 +247,15 @@ impl MappingConfig {
             return Err("mapping.window.recent must be at least 1".into());
         }
         self.limits.validate().map_err(|e| format!("mapping.limits: {e}"))?;
+        if self.refine.density_every == 0 || self.refine.density_views == 0 {
+            return Err("mapping.refine.density_every and mapping.refine.density_views must be at least 1".into());
+        }
+        if ![self.refine.growth_share, self.refine.half_size_share].iter().all(|share| (0.0..=1.0).contains(share)) {
+            return Err("mapping.refine.growth_share and mapping.refine.half_size_share must lie between 0 and 1".into());
+        }
+        if self.points.size_range < 1.0 {
+            return Err(format!("mapping.points.size_range must be at least 1, not {}", self.points.size_range));
+        }
         self.density.validate().map_err(|e| format!("mapping.density: {e}"))?;
         self.loss.validate().map_err(|e| format!("mapping.loss: {e}"))?;
         self.adam.validate().map_err(|e| format!("mapping.adam: {e}"))

@@ -1,5 +1,7 @@
 //! The mapper: owns the Gaussians, their moments and the keyframe window.
 
+mod refine;
+
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -7,15 +9,18 @@ use std::time::{Duration, Instant};
 use fastrand::Rng;
 use glam::{Quat, Vec3};
 
+pub use refine::{RefineReport, Refinement};
+
 use super::density::{self, Candidate};
 use super::keyframe::MappedKeyframe;
 use super::ledger::{self, Ledger};
 use super::schedule::{self, Session, Step};
-use super::{DensityStrategy, Keyframe, KeyframeId, LimitsConfig, MappingConfig, limits, seeding};
+use super::{DensityStrategy, Keyframe, KeyframeId, LimitsConfig, MappingConfig, limits, points, seeding};
 use crate::geometry::Se3;
 use crate::gpu::{Gpu, GpuError};
 use crate::optimise::{GaussianScore, Optimiser, StepReport, TrainingView, WrongPixels};
 use crate::render::{GpuCloud, Rasterizer, Rendered};
+use crate::sequence::KnownPoint;
 use crate::splat::GaussianCloud;
 use crate::splat::ViewCamera;
 
@@ -79,18 +84,29 @@ impl Mapper {
 
     /// Takes in a keyframe: seeds what the map lacks, optimises over the window, prunes. `stop` is asked between the steps.
     pub fn insert(&mut self, keyframe: &Keyframe, stop: &dyn Fn() -> bool) -> Result<KeyframeReport, MappingError> {
-        if keyframe.image.depth.is_none() && self.keyframes.is_empty() {
+        if keyframe.image.depth.is_none() && self.keyframes.is_empty() && self.cloud.is_empty() {
             return Err(MappingError::NoDepth { id: keyframe.id });
         }
-        let mapped = MappedKeyframe::new(&self.gpu, keyframe, self.config.skip.coarse_share > 0.0)?;
+        let mapped = MappedKeyframe::new(&self.gpu, keyframe, self.config.learns_at_half_size())?;
         let seeded = self.seed(keyframe, &mapped.camera)?;
         self.keyframes.push(mapped);
         self.limit_keyframes();
         let first = self.keyframes.len() == 1;
         let iterations = if first { self.config.first_iterations } else { self.config.iterations_per_keyframe };
+        if iterations == 0 {
+            return Ok(KeyframeReport { id: keyframe.id, seeded, gaussians: self.cloud.len(), ..KeyframeReport::default() });
+        }
         let (done, psnr_db) = self.optimise(iterations, stop)?;
         let (pruned, grown) = self.control_density()?;
         Ok(KeyframeReport { id: keyframe.id, seeded, pruned, grown, gaussians: self.cloud.len(), iterations: done, psnr_db })
+    }
+
+    /// Takes in points of the scene that are known before any keyframe, in the keyframes' world; `anchor` is the first of these.
+    pub fn add_points(&mut self, known: &[KnownPoint], anchor: KeyframeId) -> Result<(), MappingError> {
+        let seeds = points::seed(known, &self.config.points, self.config.sh_degree);
+        let left_out = self.cloud.append(&self.gpu, &seeds)?;
+        self.ledger.append(anchor, seeds.len() - left_out);
+        Ok(())
     }
 
     /// Moves earlier keyframes to better poses, and with those that move far the Gaussians seeded from them; returns how many. Unknown
@@ -130,6 +146,9 @@ impl Mapper {
     }
 
     fn seed(&mut self, keyframe: &Keyframe, camera: &ViewCamera) -> Result<usize, MappingError> {
+        if keyframe.image.depth.is_none() {
+            return Ok(0);
+        }
         let rendered = if self.cloud.is_empty() { None } else { Some(self.render(camera)?) };
         let mut seeds = seeding::seed(keyframe, rendered.as_ref(), &self.config.seeding, self.config.sh_degree);
         if self.config.limits.limits_gaussians() {

@@ -1,5 +1,5 @@
 //! The mapping thread's work: keyframes in, Gaussians seeded, optimised over a sliding window and pruned, snapshots out.
-//! Knows nothing of tracking; poses and covisibility arrive with the keyframes.
+//! A refinement over all keyframes may follow. Knows nothing of tracking; poses and covisibility arrive with the keyframes.
 
 mod config;
 mod density;
@@ -7,11 +7,13 @@ mod keyframe;
 mod ledger;
 mod limits;
 mod mapper;
+mod neighbours;
+mod points;
 mod schedule;
 mod seeding;
 
-pub use config::{MappingConfig, SeedingConfig, SkipConfig, WindowConfig};
+pub use config::{MappingConfig, PointsConfig, RefineConfig, SeedingConfig, SkipConfig, WindowConfig};
 pub use density::{ClassicConfig, DensityConfig, DensityStrategy, VcdConfig};
 pub use keyframe::{Keyframe, KeyframeId};
 pub use limits::LimitsConfig;
-pub use mapper::{KeyframeReport, Mapper, MappingError};
+pub use mapper::{KeyframeReport, Mapper, MappingError, RefineReport, Refinement};

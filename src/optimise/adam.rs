@@ -67,6 +67,19 @@ impl AdamConfig {
 }
 
 impl AdamConfig {
+    /// The same with the rate of positions multiplied by one factor, and all others by another.
+    pub fn scaled(&self, position: f32, others: f32) -> Self {
+        Self {
+            position_rate: self.position_rate * position,
+            opacity_rate: self.opacity_rate * others,
+            scale_rate: self.scale_rate * others,
+            rotation_rate: self.rotation_rate * others,
+            color_rate: self.color_rate * others,
+            harmonics_rate: self.harmonics_rate * others,
+            ..self.clone()
+        }
+    }
+
     /// The GPU's copy for step number `step` of the map, with all rates times `pace`.
     pub(super) fn setup(&self, step: usize, pace: f32) -> AdamSetup {
         let p = self.position_rate;

@@ -1,5 +1,6 @@
 //! Buffers of the image loss, for each size of view in turn.
 
+use super::TargetImage;
 use crate::gpu::{Gpu, GpuBuffer, GpuError};
 
 /// Pixels along a side of what one workgroup of the loss shaders covers.
@@ -18,6 +19,8 @@ const SIZES_KEPT: usize = 2;
 #[derive(Debug)]
 pub(super) struct ImageBuffers {
     size: (u32, u32),
+    /// The step's target, copied to one place: bind groups over each view's own buffers would be made anew all the time.
+    pub target: TargetImage,
     pub partials: GpuBuffer,
     pub gradients: GpuBuffer,
     /// Its length is the number of terms that are summed.
@@ -29,6 +32,7 @@ impl ImageBuffers {
         let blocks = u64::from(width.div_ceil(LOSS_TILE) * height.div_ceil(LOSS_TILE / 2));
         Ok(Self {
             size: (width, height),
+            target: TargetImage::blank(gpu, (width, height))?,
             partials: GpuBuffer::storage(gpu, "loss partials", u64::from(bordered(width)) * u64::from(bordered(height)) * 48)?,
             gradients: GpuBuffer::storage(gpu, "image gradients", u64::from(width * height) * 32)?,
             loss_sums: GpuBuffer::storage(gpu, "loss sums", blocks * 16)?,

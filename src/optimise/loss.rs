@@ -80,15 +80,27 @@ pub struct TargetImage {
 impl TargetImage {
     /// Uploads an image and, where the sensor has one, its depth `[H * W]` in metres; pixels at 0 do not enter the depth loss.
     pub fn new(gpu: &Gpu, image: &RgbImage, depth_metres: Option<&[f32]>) -> Result<Self, GpuError> {
-        let (width, height) = image.dimensions();
+        let target = Self::blank(gpu, image.dimensions())?;
         let packed: Vec<u32> = image.pixels().map(|p| u32::from_le_bytes([p.0[0], p.0[1], p.0[2], 255])).collect();
-        let color = GpuBuffer::storage(gpu, "target colour", packed.len() as u64 * 4)?;
-        color.write(gpu, 0, &packed);
-        let depth = GpuBuffer::storage(gpu, "target depth", packed.len() as u64 * 4)?;
+        target.color.write(gpu, 0, &packed);
         if let Some(metres) = depth_metres {
             assert_eq!(metres.len(), packed.len(), "depth has the size of the image");
-            depth.write(gpu, 0, metres);
+            target.depth.write(gpu, 0, metres);
         }
-        Ok(Self { width, height, color, depth })
+        Ok(target)
+    }
+
+    /// A black image without depth.
+    pub(super) fn blank(gpu: &Gpu, (width, height): (u32, u32)) -> Result<Self, GpuError> {
+        let bytes = u64::from(width) * u64::from(height) * 4;
+        let plane = |label: &str| GpuBuffer::storage(gpu, label, bytes);
+        Ok(Self { width, height, color: plane("target colour")?, depth: plane("target depth")? })
+    }
+
+    /// Becomes a copy of an image of the same size.
+    pub(super) fn encode_copy(&self, encoder: &mut wgpu::CommandEncoder, of: &Self) {
+        for (from, to) in [(&of.color, &self.color), (&of.depth, &self.depth)] {
+            encoder.copy_buffer_to_buffer(from.raw(), 0, to.raw(), 0, from.raw().size());
+        }
     }
 }

@@ -2,6 +2,7 @@
 
 mod adam;
 mod image_buffers;
+mod kernels;
 mod loss;
 mod optimiser;
 mod scores;

@@ -5,11 +5,12 @@ use std::time::{Duration, Instant};
 use bytemuck::{Pod, Zeroable};
 
 use super::image_buffers::{self, ImageBuffers, LOSS_TILE};
+use super::kernels::Kernels;
 use super::scores::{GaussianScore, Scores, WrongPixels};
 use super::{AdamConfig, LossConfig, LossTerms, TargetImage};
-use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, workgroups};
+use crate::gpu::{Gpu, GpuBuffer, GpuError, workgroups};
 use crate::render::layout::{AdamSetup, COUNTERS, Counter, LossSetup, VISIBLE_COUNTER, View};
-use crate::render::{BlendForm, GpuCloud, PreparedView, Rasterizer, ViewCounts, cloud_from_planes, shaders};
+use crate::render::{GpuCloud, PreparedView, Rasterizer, ViewCounts, cloud_from_planes};
 use crate::splat::{GaussianCloud, ViewCamera};
 
 /// What a step did.
@@ -62,17 +63,6 @@ enum Sink<'a> {
     Gradient(&'a GpuBuffer),
 }
 
-#[derive(Debug)]
-struct Kernels {
-    loss_forward: Kernel,
-    loss_reduce: Kernel,
-    loss_backward: Kernel,
-    rasterize_backward: Kernel,
-    project_backward: Kernel,
-    project_backward_adam: Kernel,
-    pose_reduce: Kernel,
-}
-
 /// The training step with its scratch buffers.
 #[derive(Debug)]
 pub struct Optimiser {
@@ -97,20 +87,8 @@ impl Optimiser {
 
     /// For the views that `rasterizer` renders: both passes of the blending take the same form.
     pub fn new(rasterizer: &Rasterizer) -> Result<Self, GpuError> {
-        let (gpu, form) = (rasterizer.gpu(), rasterizer.form());
-        let kernel = |source: &shaders::ShaderSource| Kernel::new(gpu, source.name, "main", &source.text(form));
-        let kernels = Kernels {
-            loss_forward: kernel(&shaders::LOSS_FORWARD),
-            loss_reduce: kernel(&shaders::LOSS_REDUCE),
-            loss_backward: kernel(&shaders::LOSS_BACKWARD),
-            rasterize_backward: kernel(match form {
-                BlendForm::Wide => &shaders::RASTERIZE_BACKWARD_SPLATS,
-                BlendForm::Narrow => &shaders::RASTERIZE_BACKWARD_PIXELS,
-            }),
-            project_backward: kernel(&shaders::PROJECT_BACKWARD),
-            project_backward_adam: kernel(&shaders::PROJECT_BACKWARD_ADAM),
-            pose_reduce: kernel(&shaders::POSE_REDUCE),
-        };
+        let gpu = rasterizer.gpu();
+        let kernels = Kernels::new(rasterizer);
         gpu.check()?;
         let empty = |label: &str| GpuBuffer::storage(gpu, label, 16);
         Ok(Self {
@@ -283,13 +261,16 @@ impl Optimiser {
         let prepared = rasterizer.prepare(cloud, camera, background)?;
         self.reserve(&gpu, &prepared.view, cloud)?;
         rasterizer.encode_clear(encoder);
+        if let Objective::Image(target, ..) = objective {
+            self.images[0].target.encode_copy(encoder, target);
+        }
         if let Sink::Gradient(buffer) = sink {
             encoder.clear_buffer(buffer.raw(), 0, None);
         }
         let mut pass = encoder.begin_compute_pass(&Default::default());
         rasterizer.encode_forward(&mut pass, cloud, &prepared);
-        if let Objective::Image(target, loss, scored) = objective {
-            self.encode_loss(&mut pass, rasterizer, target, loss);
+        if let Objective::Image(_, loss, scored) = objective {
+            self.encode_loss(&mut pass, rasterizer, loss);
             let image = (&self.images[0].gradients, &self.loss_total);
             scored.iter().for_each(|wrong| self.scores.encode(&mut pass, rasterizer, &prepared, image, (wrong, loss)));
         }
@@ -298,9 +279,10 @@ impl Optimiser {
         Ok(())
     }
 
-    fn encode_loss(&self, pass: &mut wgpu::ComputePass<'_>, rasterizer: &Rasterizer, target: &TargetImage, loss: &LossConfig) {
+    fn encode_loss(&self, pass: &mut wgpu::ComputePass<'_>, rasterizer: &Rasterizer, loss: &LossConfig) {
         let (gpu, ws, k) = (rasterizer.gpu(), &rasterizer.workspace, &self.kernels);
-        let (width, height) = (target.width, target.height);
+        let TargetImage { width, height, color, depth } = &self.images[0].target;
+        let (width, height) = (*width, *height);
         let setup = LossSetup { width, height, ssim_weight: loss.ssim_weight, depth_weight: loss.depth_weight };
         self.loss_setup.write(gpu, 0, &[setup]);
         let forward = [width.div_ceil(LOSS_TILE), height.div_ceil(LOSS_TILE / 2), 1];
@@ -309,8 +291,8 @@ impl Optimiser {
             (0, &self.loss_setup),
             (1, &ws.color_depth),
             (2, &ws.state),
-            (3, &target.color),
-            (4, &target.depth),
+            (3, color),
+            (4, depth),
             (5, &self.images[0].partials),
         ];
         let with = |last| inputs.iter().copied().chain([last]).collect::<Vec<_>>();

@@ -1,4 +1,4 @@
-//! Maps keyframes as they come and publishes a snapshot after each.
+//! Maps keyframes as they come, refines the map after the last one, and publishes a snapshot after each.
 
 use std::sync::Arc;
 
@@ -21,33 +21,34 @@ pub(super) struct MapSummary {
     pub error: Option<PipelineError>,
 }
 
-/// Maps until the tracker hangs up, or an error.
-pub(super) fn map(gpu: &Arc<Gpu>, config: &MappingConfig, messages: &Receiver<MapperMessage>, progress: &Progress) -> MapSummary {
+/// The map after a round of its refinement.
+pub(super) struct Round<'a> {
+    pub cloud: &'a Arc<GaussianCloud>,
+    /// All optimisation steps so far.
+    pub steps: usize,
+}
+
+/// Maps until the tracker hangs up, then refines; or until an error. `on_round` hears of each round of the refinement.
+pub(super) fn map(
+    gpu: &Arc<Gpu>,
+    config: &MappingConfig,
+    messages: &Receiver<MapperMessage>,
+    (progress, on_round): (&Progress, &mut dyn FnMut(Round<'_>)),
+) -> MapSummary {
     let mut summary = MapSummary::default();
     let mut mapper = match Mapper::new(gpu.clone(), config) {
         Ok(mapper) => mapper,
         Err(error) => return MapSummary { error: Some(error.into()), ..summary },
     };
-    for message in messages {
-        let done = guarded("mapping", || match message {
-            MapperMessage::PoseUpdate(updates) => {
-                let moved = mapper.update_poses(&updates)?;
-                Ok(if moved > 0 { Some((None, Arc::new(mapper.download()?))) } else { None })
-            }
-            MapperMessage::Keyframe(keyframe) => {
-                let stop = || progress.stopped() || (config.yields_to_keyframes && !messages.is_empty());
-                let report = mapper.insert(&keyframe, &stop)?;
-                Ok(Some((Some(report), Arc::new(mapper.download()?))))
-            }
-        });
+    for message in messages.iter() {
+        let stop = || progress.stopped() || (config.yields_to_keyframes && !messages.is_empty());
+        let done = guarded("mapping", || take(&mut mapper, message, &stop));
         match done {
-            Ok(None) => {}
-            Ok(Some((report, cloud))) => {
-                tracing::debug!(?report, "map changed");
-                summary.cloud = cloud.clone();
+            Ok(Taken { report, cloud }) => {
+                tracing::debug!(?report, "message taken");
                 summary.reports.extend(report);
                 let psnr_db = summary.reports.last().map_or(0.0, |r| r.psnr_db);
-                progress.mapping.force_push(MapSnapshot { cloud, keyframes: summary.reports.len(), psnr_db });
+                summary.publish(cloud, psnr_db, progress);
             }
             Err(error) => {
                 summary.error = Some(error);
@@ -55,6 +56,55 @@ pub(super) fn map(gpu: &Arc<Gpu>, config: &MappingConfig, messages: &Receiver<Ma
             }
         }
     }
+    if summary.error.is_none() {
+        let refined = guarded("mapping", || refine(&mut mapper, &mut summary, (progress, on_round)));
+        summary.error = refined.err();
+    }
     summary.step_ms = mapper.step_times().iter().map(|t| t.as_secs_f64() * 1e3).collect();
     summary
+}
+
+/// What a message did; the map, if it changed.
+struct Taken {
+    report: Option<KeyframeReport>,
+    cloud: Option<Arc<GaussianCloud>>,
+}
+
+fn take(mapper: &mut Mapper, message: MapperMessage, stop: &dyn Fn() -> bool) -> Result<Taken, PipelineError> {
+    let (report, changed) = match message {
+        MapperMessage::Points(points) => {
+            mapper.add_points(&points, 0)?;
+            (None, true)
+        }
+        MapperMessage::PoseUpdate(updates) => (None, mapper.update_poses(&updates)? > 0),
+        MapperMessage::Keyframe(keyframe) => {
+            let report = mapper.insert(&keyframe, stop)?;
+            (Some(report), report.seeded + report.iterations > 0)
+        }
+    };
+    let cloud = if changed { Some(Arc::new(mapper.download()?)) } else { None };
+    Ok(Taken { report, cloud })
+}
+
+/// The refinement, a round at a time, each published.
+fn refine(
+    mapper: &mut Mapper,
+    summary: &mut MapSummary,
+    (progress, on_round): (&Progress, &mut dyn FnMut(Round<'_>)),
+) -> Result<(), PipelineError> {
+    let mut refinement = mapper.begin_refinement()?;
+    while let Some(report) = mapper.refine(&mut refinement, &|| progress.stopped())? {
+        tracing::debug!(?report, "refined");
+        summary.publish(Some(Arc::new(mapper.download()?)), report.psnr_db, progress);
+        on_round(Round { cloud: &summary.cloud, steps: mapper.step_times().len() });
+    }
+    Ok(())
+}
+
+impl MapSummary {
+    fn publish(&mut self, changed: Option<Arc<GaussianCloud>>, psnr_db: f32, progress: &Progress) {
+        let Some(cloud) = changed else { return };
+        self.cloud = cloud.clone();
+        progress.mapping.force_push(MapSnapshot { cloud, keyframes: self.reports.len(), psnr_db });
+    }
 }

@@ -9,6 +9,7 @@ use crossbeam::queue::ArrayQueue;
 
 use crate::geometry::Se3;
 use crate::mapping::{Keyframe, KeyframeId, MappingError};
+use crate::sequence::KnownPoint;
 use crate::splat::MapSnapshot;
 use crate::tracking::TrackingError;
 
@@ -27,6 +28,14 @@ pub enum PipelineError {
     )]
     NoFirstDepth { color: PathBuf },
     #[error(
+        "{name} has no pose within {seconds} s of any frame; known poses come from COLMAP's model, transforms.json or the recording's ground truth: leave --known-poses out to track instead"
+    )]
+    NoKnownPoses { name: String, seconds: f64 },
+    #[error(
+        "{name} has neither depth nor points to begin a map from; give COLMAP's model with its points (sparse/0/points3D.bin), or leave --known-poses out"
+    )]
+    NoKnownPoints { name: String },
+    #[error(
         "images would be mapped at {width}x{height}, but the least is {least}x{least}; raise the mapping resolution (--map-scale)"
     )]
     TooSmall { width: u32, height: u32, least: u32 },
@@ -39,6 +48,8 @@ pub enum PipelineError {
 /// Tracker → mapper. The end of the sequence is the channel's end.
 #[derive(Clone, Debug)]
 pub enum MapperMessage {
+    /// Points of the scene that came with the recording, before the first keyframe.
+    Points(Vec<KnownPoint>),
     Keyframe(Box<Keyframe>),
     /// Earlier keyframes that bundle adjustment moved.
     PoseUpdate(Vec<(KeyframeId, Se3)>),

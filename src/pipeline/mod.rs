@@ -9,6 +9,7 @@
 //! No lock is taken on the per-frame path. A thread that panics ends its own work; what it had is still returned.
 
 mod budget;
+mod known_poses;
 mod map_thread;
 mod messages;
 pub mod outputs;
@@ -18,6 +19,7 @@ mod run;
 mod track_thread;
 
 pub use budget::{Budget, realtime_scale};
+pub use known_poses::check_known_poses;
 pub use messages::{MapperMessage, PipelineError, Progress};
 pub use recording::{Mapped, Recording, record};
 pub use run::{Outcome, check_first_depth, check_size, run};

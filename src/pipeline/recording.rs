@@ -3,12 +3,12 @@
 
 use std::sync::Arc;
 use std::thread::Builder;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use crossbeam::channel::{bounded, unbounded};
 
-use super::map_thread::{self, MapSummary};
-use super::{MapperMessage, PipelineError, Progress, read_thread, track_thread};
+use super::map_thread::{self, MapSummary, Round};
+use super::{MapperMessage, PipelineError, Progress, known_poses, read_thread, track_thread};
 use crate::config::Config;
 use crate::geometry::Se3;
 use crate::gpu::Gpu;
@@ -25,6 +25,8 @@ pub struct Recording {
     pub messages: Vec<MapperMessage>,
     /// `(frame index, world_from_camera)` of every tracked frame.
     pub poses: Vec<(usize, Se3)>,
+    /// Units of its world to a metre as the mapper's lengths mean it.
+    units_per_metre: f64,
 }
 
 /// What a mapper made of a recording.
@@ -43,33 +45,52 @@ pub struct Mapped {
 pub fn record(sequence: &Sequence, config: &Config, progress: &Progress) -> Result<Recording, PipelineError> {
     let (frame_sender, frames) = bounded(FRAMES_AHEAD);
     let (message_sender, messages) = unbounded();
+    let known_poses = config.replay.known_poses;
+    let follow = if known_poses { known_poses::follow } else { track_thread::track };
+    let units_per_metre = if known_poses { known_poses::units_per_metre(sequence) } else { 1.0 };
     let track = std::thread::scope(|scope| {
         Builder::new()
             .name("reading".into())
             .spawn_scoped(scope, move || read_thread::read(sequence, false, &frame_sender, progress))
             .map_err(|source| PipelineError::Spawn { thread: "reading", source })?;
-        Ok::<_, PipelineError>(track_thread::track(sequence, config, &frames, &message_sender, progress))
+        Ok::<_, PipelineError>(follow(sequence, config, &frames, &message_sender, progress))
     })?;
     drop(message_sender);
     if let Some(error) = track.error {
         return Err(error);
     }
     let poses = track.trajectory.iter().map(|(index, pose)| (*index, pose.world_from_camera)).collect();
-    Ok(Recording { messages: messages.into_iter().collect(), poses })
+    Ok(Recording { messages: messages.into_iter().collect(), poses, units_per_metre })
 }
 
 impl Recording {
-    /// Maps the recording from its beginning.
+    /// Maps the recording from its beginning. `on_round` hears what there is after each round of a refinement; the time that it takes is
+    /// not counted.
     ///
     /// # Errors
     /// What ended mapping early.
-    pub fn map(&self, gpu: &Arc<Gpu>, config: &MappingConfig, progress: &Progress) -> Result<Mapped, PipelineError> {
+    pub fn map(
+        &self,
+        gpu: &Arc<Gpu>,
+        config: &MappingConfig,
+        progress: &Progress,
+        on_round: &mut dyn FnMut(Mapped),
+    ) -> Result<Mapped, PipelineError> {
         let (sender, messages) = unbounded();
         self.messages.iter().for_each(|message| sender.send(message.clone()).expect("the receiver is here"));
         drop(sender);
         let started = Instant::now();
-        let MapSummary { cloud, step_ms, error, .. } = map_thread::map(gpu, config, &messages, progress);
-        let mapped = Mapped { cloud, wall_s: started.elapsed().as_secs_f64(), steps: step_ms.len() };
+        let mut paused = Duration::ZERO;
+        let mut on_round = |round: Round<'_>| {
+            let reached = Instant::now();
+            let wall_s = (started.elapsed() - paused).as_secs_f64();
+            on_round(Mapped { cloud: round.cloud.clone(), wall_s, steps: round.steps });
+            paused += reached.elapsed();
+        };
+        let config = config.in_units(self.units_per_metre as f32);
+        let summary = map_thread::map(gpu, &config, &messages, (progress, &mut on_round));
+        let MapSummary { cloud, step_ms, error, .. } = summary;
+        let mapped = Mapped { cloud, wall_s: (started.elapsed() - paused).as_secs_f64(), steps: step_ms.len() };
         error.map_or(Ok(mapped), Err)
     }
 }

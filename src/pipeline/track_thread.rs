@@ -23,7 +23,7 @@ pub(super) struct TrackSummary {
 }
 
 /// The way to the mapper, with its overflow policy.
-struct KeyframeSender<'a> {
+pub(super) struct KeyframeSender<'a> {
     sender: &'a Sender<MapperMessage>,
     paced: bool,
     /// Paced: the newest keyframe that found the channel full.
@@ -31,9 +31,13 @@ struct KeyframeSender<'a> {
     deferred: usize,
 }
 
-impl KeyframeSender<'_> {
+impl<'a> KeyframeSender<'a> {
+    pub fn new(sender: &'a Sender<MapperMessage>, paced: bool) -> Self {
+        Self { sender, paced, waiting: None, deferred: 0 }
+    }
+
     /// Says whether the mapper still listens.
-    fn send(&mut self, message: MapperMessage) -> bool {
+    pub fn send(&mut self, message: MapperMessage) -> bool {
         if !self.paced {
             return self.sender.send(message).is_ok();
         }
@@ -50,11 +54,19 @@ impl KeyframeSender<'_> {
         }
     }
 
-    fn retry(&mut self) -> bool {
+    pub fn retry(&mut self) -> bool {
         match self.waiting.take() {
             Some(message) => self.send(message),
             None => true,
         }
+    }
+
+    /// Sends the last keyframe, which has no newer one to give way to; returns how many the mapper never got.
+    pub fn finish(self) -> usize {
+        if let Some(message) = self.waiting {
+            let _ = self.sender.send(message);
+        }
+        self.deferred
     }
 }
 
@@ -72,7 +84,7 @@ pub(super) fn track(
         Err(error) => return TrackSummary { error: Some(error.into()), ..summary },
     };
     let rectifier = Rectifier::new(&sequence.camera, config.map_scale);
-    let mut sender = KeyframeSender { sender: mapper, paced: config.replay.paced, waiting: None, deferred: 0 };
+    let mut sender = KeyframeSender::new(mapper, config.replay.paced);
     for frame in frames {
         let may_be_keyframe = !config.replay.is_held_out(frame.index);
         let tracked = match guarded("tracking", || Ok(tracker.track(&frame, may_be_keyframe)?)) {
@@ -94,11 +106,7 @@ pub(super) fn track(
     if let Err(error) = guarded("tracking", || Ok(tracker.finish()?)) {
         summary.error.get_or_insert(error);
     }
-    if let Some(message) = sender.waiting.take() {
-        // The last keyframe has no newer one to give way to.
-        let _ = mapper.send(message);
-    }
-    summary.deferred = sender.deferred;
+    summary.deferred = sender.finish();
     summary.trajectory = tracker.trajectory();
     summary.keyframes = tracker.keyframes();
     let last_word = summary.keyframes.iter().map(|k| (k.id, k.world_from_camera)).collect();

@@ -8,7 +8,7 @@ use keysplat::config::Config;
 use keysplat::evaluation::metrics::ImageFigures;
 use keysplat::evaluation::views::{ViewSelection, evaluate_views};
 use keysplat::gpu::Gpu;
-use keysplat::pipeline::{self, Progress, Recording};
+use keysplat::pipeline::{self, Mapped, Progress, Recording};
 use keysplat::sequence::Sequence;
 use keysplat::splat::GaussianCloud;
 use miette::IntoDiagnostic;
@@ -26,6 +26,9 @@ pub(super) struct AblationArgs {
     /// Steps after each keyframe: every variant is run with each of these numbers, which gives it a curve.
     #[arg(long, value_delimiter = ',')]
     iterations: Vec<usize>,
+    /// Print a row about every so many steps of the refinement, too; the time of measuring is not counted.
+    #[arg(long, value_name = "STEPS")]
+    rows_every: Option<usize>,
 }
 
 /// Settings that differ from the base.
@@ -51,6 +54,13 @@ struct Row {
     held_out: Option<ImageFigures>,
 }
 
+impl Row {
+    fn new(variant: &Variant, iterations_per_keyframe: usize, mapped: &Mapped, held_out: Option<ImageFigures>) -> Self {
+        let (mapping_s, steps, gaussians) = (mapped.wall_s, mapped.steps, mapped.cloud.len());
+        Self { variant: variant.name.clone(), iterations_per_keyframe, mapping_s, steps, gaussians, held_out }
+    }
+}
+
 pub(super) fn ablation(args: &AblationArgs) -> miette::Result<()> {
     let mut base = args.run.resolve()?;
     let sequence = run::open(&mut base)?;
@@ -67,19 +77,26 @@ pub(super) fn ablation(args: &AblationArgs) -> miette::Result<()> {
         for &iterations in if args.iterations.is_empty() { &own } else { args.iterations.as_slice() } {
             let mut config = config.clone();
             config.mapping.iterations_per_keyframe = iterations;
-            let mapped = recording.map(&gpu, &config.mapping, &Progress::default()).into_diagnostic()?;
-            let row = Row {
-                variant: variant.name.clone(),
-                iterations_per_keyframe: iterations,
-                mapping_s: mapped.wall_s,
-                steps: mapped.steps,
-                gaussians: mapped.cloud.len(),
-                held_out: held_out((&sequence, &config), &gpu, &recording, &mapped.cloud)?,
+            let mut row = |mapped: &Mapped| -> miette::Result<()> {
+                let held_out = held_out((&sequence, &config), &gpu, &recording, &mapped.cloud);
+                rows.push(Row::new(variant, iterations, mapped, held_out?));
+                print(rows.last().expect("one was pushed"));
+                Ok(())
             };
-            print(&row);
-            rows.push(row);
+            let every = args.rows_every.unwrap_or(usize::MAX).max(1);
+            let (mut next, mut failed) = (every, Ok(()));
+            let mut on_round = |mapped: Mapped| {
+                if mapped.steps >= next && failed.is_ok() {
+                    next = (mapped.steps / every + 1).saturating_mul(every);
+                    failed = row(&mapped);
+                }
+            };
+            let mapped = recording.map(&gpu, &config.mapping, &Progress::default(), &mut on_round).into_diagnostic()?;
+            failed?;
+            row(&mapped)?;
         }
     }
+    std::fs::create_dir_all(&args.run.out).into_diagnostic()?;
     let text = serde_json::to_string_pretty(&rows).into_diagnostic()?;
     keysplat::export::write_atomically(&args.run.out.join("ablation.json"), text.as_bytes()).into_diagnostic()?;
     Ok(())

@@ -107,6 +107,13 @@ impl DensityConfig {
         WrongPixels { error_ratio, noise }
     }
 
+    /// The same, but nothing is divided any more.
+    pub fn without_growth(&self) -> Self {
+        let mut still = self.clone();
+        (still.vcd.max_growth, still.classic.gradient) = (0.0, f32::MAX);
+        still
+    }
+
     /// Says what is wrong with the values, if anything.
     pub fn validate(&self) -> Result<(), String> {
         if self.views == 0 {

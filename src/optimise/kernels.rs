@@ -1,0 +1,35 @@
+//! The compiled passes of a training step after the forward rendering.
+
+use crate::gpu::Kernel;
+use crate::render::{BlendForm, Rasterizer, shaders};
+
+#[derive(Debug)]
+pub(super) struct Kernels {
+    pub loss_forward: Kernel,
+    pub loss_reduce: Kernel,
+    pub loss_backward: Kernel,
+    pub rasterize_backward: Kernel,
+    pub project_backward: Kernel,
+    pub project_backward_adam: Kernel,
+    pub pose_reduce: Kernel,
+}
+
+impl Kernels {
+    /// For the views that `rasterizer` renders: both passes of the blending take the same form.
+    pub fn new(rasterizer: &Rasterizer) -> Self {
+        let (gpu, form) = (rasterizer.gpu(), rasterizer.form());
+        let kernel = |source: &shaders::ShaderSource| Kernel::new(gpu, source.name, "main", &source.text(form));
+        Self {
+            loss_forward: kernel(&shaders::LOSS_FORWARD),
+            loss_reduce: kernel(&shaders::LOSS_REDUCE),
+            loss_backward: kernel(&shaders::LOSS_BACKWARD),
+            rasterize_backward: kernel(match form {
+                BlendForm::Wide => &shaders::RASTERIZE_BACKWARD_SPLATS,
+                BlendForm::Narrow => &shaders::RASTERIZE_BACKWARD_PIXELS,
+            }),
+            project_backward: kernel(&shaders::PROJECT_BACKWARD),
+            project_backward_adam: kernel(&shaders::PROJECT_BACKWARD_ADAM),
+            pose_reduce: kernel(&shaders::POSE_REDUCE),
+        }
+    }
+}

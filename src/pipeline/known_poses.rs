@@ -1,0 +1,202 @@
+//! Takes the place of tracking where the recording says where its frames were taken.
+//!
+//! Photos become keyframes all, frames of a moving camera where it has moved as far as the tracker would ask for; held-out ones never.
+//! Frames without a pose count as lost. Where the recording has no depth, its points begin the map, and the world's unit is theirs.
+
+use std::collections::HashSet;
+use std::time::Instant;
+
+use crossbeam::channel::{Receiver, Sender};
+use nalgebra::{Point3, Vector3};
+use rayon::prelude::*;
+
+use super::messages::{TrackingProgress, guarded};
+use super::track_thread::{KeyframeSender, TrackSummary};
+use super::{MapperMessage, PipelineError, Progress};
+use crate::config::Config;
+use crate::evaluation::trajectory::MAX_TIME_DIFFERENCE_S;
+use crate::geometry::{Se3, StampedPose};
+use crate::mapping::{Keyframe, MappingConfig};
+use crate::sequence::{Frame, KnownPoint, Layout, RectifiedImage, Rectifier, Sensor, Sequence};
+use crate::tracking::KeyframePose;
+
+/// What the mapper's lengths are made for: the median distance, in metres, at which a camera sees things in a room.
+const USUAL_DISTANCE_METRES: f64 = 2.0;
+/// Cameras and points that are looked at for the scene's own distance: enough for a median.
+const SAMPLED_CAMERAS: usize = 50;
+const SAMPLED_POINTS: usize = 2000;
+/// Neighbours that a keyframe names.
+const COVISIBLE: usize = 10;
+
+/// Says before any work whether a recording can be mapped by its own poses.
+pub fn check_known_poses(sequence: &Sequence) -> Result<(), PipelineError> {
+    let name = || sequence.name.clone();
+    if !sequence.entries.iter().any(|entry| known_pose(sequence, entry.timestamp_s).is_some()) {
+        return Err(PipelineError::NoKnownPoses { name: name(), seconds: MAX_TIME_DIFFERENCE_S });
+    }
+    let seeded = sequence.sensor == Sensor::Rgbd || !sequence.points.is_empty();
+    if seeded { Ok(()) } else { Err(PipelineError::NoKnownPoints { name: name() }) }
+}
+
+/// world_from_camera at a time.
+fn known_pose(sequence: &Sequence, timestamp_s: f64) -> Option<Se3> {
+    let truth = sequence.groundtruth.as_ref()?;
+    truth.nearest(timestamp_s, MAX_TIME_DIFFERENCE_S).map(|i| truth.poses[i].world_from_camera)
+}
+
+/// Units of the known world to a metre as the mapper's lengths mean it: 1 where depth is measured, else such that the points are as
+/// far as things in a room are.
+pub(super) fn units_per_metre(sequence: &Sequence) -> f64 {
+    if sequence.sensor == Sensor::Rgbd { 1.0 } else { scene_distance(sequence).map_or(1.0, |d| d / USUAL_DISTANCE_METRES) }
+}
+
+/// Median depth of the points in the cameras that have them in view.
+fn scene_distance(sequence: &Sequence) -> Option<f64> {
+    let sample = |len: usize, most: usize| (0..len).step_by(len.div_ceil(most).max(1));
+    let pinhole = &sequence.camera.pinhole;
+    let mut depths = Vec::new();
+    for entry in sample(sequence.entries.len(), SAMPLED_CAMERAS).map(|i| &sequence.entries[i]) {
+        let Some(world_from_camera) = known_pose(sequence, entry.timestamp_s) else { continue };
+        let camera_from_world = world_from_camera.inverse();
+        for point in sample(sequence.points.len(), SAMPLED_POINTS).map(|i| &sequence.points[i]) {
+            let p_in_camera = (camera_from_world * Point3::from(point.position)).coords;
+            let seen = pinhole.project(&p_in_camera).is_some_and(|pixel| pinhole.contains(&pixel, 0.0));
+            depths.extend(seen.then_some(p_in_camera.z));
+        }
+    }
+    median(depths)
+}
+
+fn median(mut values: Vec<f64>) -> Option<f64> {
+    values.sort_by(f64::total_cmp);
+    values.get(values.len() / 2).copied()
+}
+
+/// The points that begin the map: of those that share a cube of `mapping.points.spacing_pixels` in the nearest view, the first. Denser ones
+/// would only cost time. Points that no frame sees are left out.
+fn thinned_points(sequence: &Sequence, config: &Config) -> Vec<KnownPoint> {
+    let poses = sequence.entries.iter().filter_map(|entry| known_pose(sequence, entry.timestamp_s));
+    let cameras: Vec<Se3> = poses.map(|world_from_camera| world_from_camera.inverse()).collect();
+    let pinhole = &sequence.camera.pinhole;
+    let cell_per_depth = f64::from(config.mapping.points.spacing_pixels) / (pinhole.fx * config.map_scale);
+    let cell = |point: &KnownPoint| {
+        let in_cameras = cameras.iter().map(|camera_from_world| (camera_from_world * Point3::from(point.position)).coords);
+        let seen = in_cameras.filter(|p| pinhole.project(p).is_some_and(|pixel| pinhole.contains(&pixel, 0.0)));
+        let depth = seen.map(|p| p.z).min_by(f64::total_cmp)?;
+        // Sides are powers of two, so that cubes of like distances are the same ones.
+        let level = (depth * cell_per_depth).log2().round();
+        Some((level as i64, point.position.map(|v| (v / level.exp2()).floor() as i64)))
+    };
+    let cells: Vec<Option<(i64, Vector3<i64>)>> = sequence.points.par_iter().map(cell).collect();
+    let mut taken = HashSet::new();
+    let first = |cell: Option<(i64, Vector3<i64>)>| cell.is_some_and(|cell| taken.insert(cell));
+    let keep: Vec<bool> = cells.into_iter().map(first).collect();
+    sequence.points.iter().zip(keep).filter(|(_, keep)| *keep).map(|(point, _)| *point).collect()
+}
+
+/// The mapper's configuration for a recording.
+pub(super) fn mapping_config(sequence: &Sequence, config: &Config) -> MappingConfig {
+    if config.replay.known_poses {
+        config.mapping.in_units(units_per_metre(sequence) as f32)
+    } else {
+        config.mapping.clone()
+    }
+}
+
+/// A keyframe so far.
+struct Known {
+    pose: KeyframePose,
+    /// Median distance of what it sees, in the world's unit.
+    distance: f64,
+}
+
+struct Follower<'a> {
+    sequence: &'a Sequence,
+    config: &'a Config,
+    rectifier: Rectifier,
+    keyframes: Vec<Known>,
+    /// Where frames have no depth.
+    scene_distance: f64,
+}
+
+impl Follower<'_> {
+    /// How far apart two views are: 1 where a keyframe is due, by distance or by angle.
+    fn apart(&self, a: &Known, world_from_camera: &Se3) -> f64 {
+        let a_from_camera = a.pose.world_from_camera.inverse() * world_from_camera;
+        let moved = a_from_camera.translation.vector.norm() / (self.config.tracking.keyframe_translation * a.distance);
+        moved.max(a_from_camera.rotation.angle() / self.config.tracking.keyframe_rotation_rad)
+    }
+
+    fn is_due(&self, index: usize, world_from_camera: &Se3) -> bool {
+        let photos = matches!(self.sequence.layout, Layout::Colmap | Layout::Transforms);
+        let far = |last: &Known| self.apart(last, world_from_camera) >= 1.0;
+        !self.config.replay.is_held_out(index) && (photos || self.keyframes.last().is_none_or(far))
+    }
+
+    /// The nearest keyframes, nearest first.
+    fn covisible(&self, world_from_camera: &Se3) -> Vec<usize> {
+        let mut nearest: Vec<(f64, usize)> =
+            self.keyframes.iter().map(|known| (self.apart(known, world_from_camera), known.pose.id)).collect();
+        nearest.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+        nearest.into_iter().take(COVISIBLE).map(|(_, id)| id).collect()
+    }
+
+    fn make_keyframe(&mut self, frame: &Frame, world_from_camera: Se3) -> Keyframe {
+        let image = self.rectifier.rectify(frame);
+        let (id, covisible) = (self.keyframes.len(), self.covisible(&world_from_camera));
+        let pose = KeyframePose { id, frame_index: frame.index, timestamp_s: frame.timestamp_s, world_from_camera };
+        let distance = median_depth(&image).unwrap_or(self.scene_distance);
+        self.keyframes.push(Known { pose, distance });
+        Keyframe { id, world_from_camera, image, covisible }
+    }
+}
+
+fn median_depth(image: &RectifiedImage) -> Option<f64> {
+    let depth = image.depth.as_ref()?;
+    median(depth.metres.iter().filter(|metres| **metres > 0.0).map(|metres| f64::from(*metres)).collect())
+}
+
+/// Hands frames on at their known poses until they end, or the mapper stops listening.
+pub(super) fn follow(
+    sequence: &Sequence,
+    config: &Config,
+    frames: &Receiver<Frame>,
+    mapper: &Sender<MapperMessage>,
+    progress: &Progress,
+) -> TrackSummary {
+    let mut summary = TrackSummary::default();
+    let mut sender = KeyframeSender::new(mapper, config.replay.paced);
+    let rectifier = Rectifier::new(&sequence.camera, config.map_scale);
+    let scene_distance = scene_distance(sequence).unwrap_or(USUAL_DISTANCE_METRES);
+    let mut follower = Follower { sequence, config, rectifier, keyframes: Vec::new(), scene_distance };
+    if sequence.sensor != Sensor::Rgbd && mapper.send(MapperMessage::Points(thinned_points(sequence, config))).is_err() {
+        return summary;
+    }
+    for frame in frames {
+        let started = Instant::now();
+        let known = known_pose(sequence, frame.timestamp_s);
+        let mut keyframe = None;
+        if let Some(world_from_camera) = known {
+            summary.trajectory.push((frame.index, StampedPose { timestamp_s: frame.timestamp_s, world_from_camera }));
+            if follower.is_due(frame.index, &world_from_camera) {
+                keyframe = Some(guarded("tracking", || Ok(follower.make_keyframe(&frame, world_from_camera))));
+            }
+        }
+        summary.times_ms.push(started.elapsed().as_secs_f64() * 1e3);
+        let (frames_done, keyframes) = (frame.index + 1, follower.keyframes.len());
+        progress.tracking.force_push(TrackingProgress { frames_done, keyframes, lost: known.is_none() });
+        let message = match keyframe.transpose() {
+            Ok(keyframe) => keyframe.map(|keyframe| MapperMessage::Keyframe(Box::new(keyframe))),
+            Err(error) => {
+                summary.error = Some(error);
+                break;
+            }
+        };
+        if !sender.retry() || !message.is_none_or(|message| sender.send(message)) {
+            break;
+        }
+    }
+    summary.deferred = sender.finish();
+    summary.keyframes = follower.keyframes.iter().map(|known| known.pose).collect();
+    summary
+}
