@@ -117,7 +117,8 @@ impl Config {
             let last = parts.pop().unwrap_or_default();
             let mut inner = &mut table;
             for part in parts {
-                inner = inner.get_mut(part).and_then(toml::Value::as_table_mut).ok_or_else(|| wrong("there is no such setting"))?;
+                inner =
+                    inner.get_mut(part).and_then(toml::Value::as_table_mut).ok_or_else(|| wrong("there is no such setting"))?;
             }
             inner.insert(last.into(), value);
         }
@@ -181,7 +182,8 @@ mod tests {
 
     #[test]
     fn single_values_are_set_by_their_keys() {
-        let config = Config::default().with_settings(&["mapping.seed=7", "adapter=llvmpipe", "mapping.loss.ssim_weight=0.3"]).unwrap();
+        let config =
+            Config::default().with_settings(&["mapping.seed=7", "adapter=llvmpipe", "mapping.loss.ssim_weight=0.3"]).unwrap();
         assert_eq!((config.mapping.seed, config.adapter.as_deref(), config.mapping.loss.ssim_weight), (7, Some("llvmpipe"), 0.3));
         let wrong = |text: &str| Config::default().with_settings(&[text]).unwrap_err().to_string();
         assert!(wrong("mapping.seeed=7").contains("seeed") && wrong("maping.seed=7").contains("no such"));

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::DensityConfig;
+use super::{DensityConfig, RefinePosesConfig};
 use crate::optimise::{AdamConfig, LossConfig};
 use crate::splat::ShDegree;
 
@@ -20,6 +20,7 @@ pub struct MappingConfig {
     pub seed: u64,
     pub window: WindowConfig,
     pub skip: SkipConfig,
+    pub refine_poses: RefinePosesConfig,
     pub seeding: SeedingConfig,
     pub density: DensityConfig,
     pub loss: LossConfig,
@@ -35,6 +36,7 @@ impl Default for MappingConfig {
             seed: 0,
             window: WindowConfig::default(),
             skip: SkipConfig::default(),
+            refine_poses: RefinePosesConfig::default(),
             seeding: SeedingConfig::default(),
             density: DensityConfig::default(),
             loss: LossConfig::default(),
@@ -154,6 +156,7 @@ impl MappingConfig {
         if self.window.recent == 0 {
             return Err("mapping.window.recent must be at least 1".into());
         }
+        self.refine_poses.validate().map_err(|e| format!("mapping.refine_poses: {e}"))?;
         self.density.validate().map_err(|e| format!("mapping.density: {e}"))?;
         self.loss.validate().map_err(|e| format!("mapping.loss: {e}"))?;
         self.adam.validate().map_err(|e| format!("mapping.adam: {e}"))

@@ -6,6 +6,7 @@ mod density;
 mod keyframe;
 mod ledger;
 mod mapper;
+mod refine_poses;
 mod schedule;
 mod seeding;
 
@@ -13,3 +14,4 @@ pub use config::{MappingConfig, SeedingConfig, SkipConfig, WindowConfig};
 pub use density::{ClassicConfig, DensityConfig, DensityStrategy, VcdConfig};
 pub use keyframe::{Keyframe, KeyframeId};
 pub use mapper::{KeyframeReport, Mapper, MappingError};
+pub use refine_poses::{RefinePosesConfig, RefinedPair};

@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use crossbeam::channel::Receiver;
 
+use super::measurements::Teller;
 use super::messages::guarded;
 use super::{MapperMessage, PipelineError, Progress};
 use crate::gpu::Gpu;
@@ -22,7 +23,13 @@ pub(super) struct MapSummary {
 }
 
 /// Maps until the tracker hangs up, or an error.
-pub(super) fn map(gpu: &Arc<Gpu>, config: &MappingConfig, messages: &Receiver<MapperMessage>, progress: &Progress) -> MapSummary {
+pub(super) fn map(
+    gpu: &Arc<Gpu>,
+    config: &MappingConfig,
+    messages: &Receiver<MapperMessage>,
+    tracker: &Teller,
+    progress: &Progress,
+) -> MapSummary {
     let mut summary = MapSummary::default();
     let mut mapper = match Mapper::new(gpu.clone(), config) {
         Ok(mapper) => mapper,
@@ -36,6 +43,7 @@ pub(super) fn map(gpu: &Arc<Gpu>, config: &MappingConfig, messages: &Receiver<Ma
             }
             MapperMessage::Keyframe(keyframe) => {
                 let report = mapper.insert(&keyframe, &|| progress.stopped())?;
+                tracker.tell(keyframe.id, &mapper.refined());
                 Ok(Some((Some(report), Arc::new(mapper.download()?))))
             }
         });

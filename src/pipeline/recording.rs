@@ -8,6 +8,7 @@ use std::time::Instant;
 use crossbeam::channel::{bounded, unbounded};
 
 use super::map_thread::{self, MapSummary};
+use super::measurements::{Listener, Teller};
 use super::{MapperMessage, PipelineError, Progress, read_thread, track_thread};
 use crate::config::Config;
 use crate::geometry::Se3;
@@ -48,7 +49,7 @@ pub fn record(sequence: &Sequence, config: &Config, progress: &Progress) -> Resu
             .name("reading".into())
             .spawn_scoped(scope, move || read_thread::read(sequence, false, &frame_sender, progress))
             .map_err(|source| PipelineError::Spawn { thread: "reading", source })?;
-        Ok::<_, PipelineError>(track_thread::track(sequence, config, &frames, &message_sender, progress))
+        Ok::<_, PipelineError>(track_thread::track(sequence, config, &frames, &message_sender, Listener::default(), progress))
     })?;
     drop(message_sender);
     if let Some(error) = track.error {
@@ -68,7 +69,7 @@ impl Recording {
         self.messages.iter().for_each(|message| sender.send(message.clone()).expect("the receiver is here"));
         drop(sender);
         let started = Instant::now();
-        let MapSummary { cloud, step_ms, error, .. } = map_thread::map(gpu, config, &messages, progress);
+        let MapSummary { cloud, step_ms, error, .. } = map_thread::map(gpu, config, &messages, &Teller::default(), progress);
         let mapped = Mapped { cloud, wall_s: started.elapsed().as_secs_f64(), steps: step_ms.len() };
         error.map_or(Ok(mapped), Err)
     }
