@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{DensityConfig, LimitsConfig};
+use super::{DensityConfig, LimitsConfig, RefinePosesConfig};
 use crate::optimise::{AdamConfig, LossConfig};
 use crate::splat::ShDegree;
 
@@ -23,6 +23,7 @@ pub struct MappingConfig {
     pub window: WindowConfig,
     pub skip: SkipConfig,
     pub limits: LimitsConfig,
+    pub refine_poses: RefinePosesConfig,
     pub seeding: SeedingConfig,
     pub points: PointsConfig,
     pub refine: RefineConfig,
@@ -42,6 +43,7 @@ impl Default for MappingConfig {
             window: WindowConfig::default(),
             skip: SkipConfig::default(),
             limits: LimitsConfig::default(),
+            refine_poses: RefinePosesConfig::default(),
             seeding: SeedingConfig::default(),
             points: PointsConfig::default(),
             refine: RefineConfig::default(),
@@ -194,11 +196,8 @@ impl MappingConfig {
     /// The same for a world whose unit is not the metre but `units_per_metre` to one: each length is given in that unit.
     pub fn in_units(&self, units_per_metre: f32) -> Self {
         let mut scaled = self.clone();
-        let lengths = [
-            &mut scaled.density.max_scale_metres,
-            &mut scaled.seeding.min_depth_metres,
-            &mut scaled.seeding.max_depth_metres,
-        ];
+        let lengths =
+            [&mut scaled.density.max_scale_metres, &mut scaled.seeding.min_depth_metres, &mut scaled.seeding.max_depth_metres];
         lengths.into_iter().for_each(|length| *length *= units_per_metre);
         scaled.loss.depth_weight /= units_per_metre;
         scaled
@@ -256,6 +255,7 @@ impl MappingConfig {
         if self.points.size_range < 1.0 {
             return Err(format!("mapping.points.size_range must be at least 1, not {}", self.points.size_range));
         }
+        self.refine_poses.validate().map_err(|e| format!("mapping.refine_poses: {e}"))?;
         self.density.validate().map_err(|e| format!("mapping.density: {e}"))?;
         self.loss.validate().map_err(|e| format!("mapping.loss: {e}"))?;
         self.adam.validate().map_err(|e| format!("mapping.adam: {e}"))

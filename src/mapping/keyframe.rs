@@ -2,6 +2,7 @@
 
 use image::{Rgb, RgbImage};
 
+use super::refine_poses::{RefinePosesConfig, Refinement, median_depth};
 use crate::geometry::{Pinhole, Se3};
 use crate::gpu::{Gpu, GpuError};
 use crate::optimise::{TargetImage, TrainingView, WrongPixels};
@@ -25,7 +26,13 @@ pub struct Keyframe {
 #[derive(Debug)]
 pub(super) struct MappedKeyframe {
     pub id: KeyframeId,
+    /// At the refined pose.
     pub camera: ViewCamera,
+    /// The tracker's camera_from_world, which the refinement goes out from.
+    pub tracked_from_world: Se3,
+    pub refinement: Refinement,
+    /// Median of the measured depths.
+    pub depth_metres: f64,
     /// Until it is given back.
     image: Option<Images>,
     pub covisible: Vec<KeyframeId>,
@@ -48,15 +55,30 @@ impl MappedKeyframe {
             let depth = image.depth.as_ref().map(|d| d.metres.as_slice());
             TargetImage::new(gpu, &image.color, depth)
         };
-        let image = &keyframe.image;
+        let (image, tracked_from_world) = (&keyframe.image, keyframe.world_from_camera.inverse());
         let worth = with_half && image.pinhole.width.min(image.pinhole.height) >= MIN_HALVED;
         Ok(Self {
             id: keyframe.id,
-            camera: ViewCamera { pinhole: image.pinhole, camera_from_world: keyframe.world_from_camera.inverse() },
+            camera: ViewCamera { pinhole: image.pinhole, camera_from_world: tracked_from_world },
+            tracked_from_world,
+            refinement: Refinement::default(),
+            depth_metres: median_depth(image),
             image: Some(Images { whole: target(image)?, half: worth.then(|| target(&halved(image))).transpose()? }),
             covisible: keyframe.covisible.clone(),
             loss: 1.0,
         })
+    }
+
+    /// The tracker moved it; its refinement goes along.
+    pub fn track(&mut self, tracked_from_world: Se3) {
+        self.tracked_from_world = tracked_from_world;
+        self.camera.camera_from_world = self.refinement.refined_from_tracked * tracked_from_world;
+    }
+
+    /// Follows the images by one step, see [`Refinement::step`].
+    pub fn refine(&mut self, gradient: &[f32; 6], pace: f32, config: &RefinePosesConfig) {
+        self.refinement.step(gradient, pace, config);
+        self.track(self.tracked_from_world);
     }
 
     /// Whether steps can still learn from it.

@@ -14,6 +14,7 @@ pub use refine::{RefineReport, Refinement};
 use super::density::{self, Candidate};
 use super::keyframe::MappedKeyframe;
 use super::ledger::{self, Ledger};
+use super::refine_poses::{self, RefinedPair};
 use super::schedule::{self, Session, Step};
 use super::{DensityStrategy, Keyframe, KeyframeId, LimitsConfig, MappingConfig, limits, points, seeding};
 use crate::geometry::Se3;
@@ -116,14 +117,22 @@ impl Mapper {
         let updates: BTreeMap<KeyframeId, &Se3> = updates.iter().map(|(id, pose)| (*id, pose)).collect();
         for keyframe in &mut self.keyframes {
             if let Some(world_from_camera) = updates.get(&keyframe.id) {
-                let old_world_from_camera = keyframe.camera.camera_from_world.inverse();
+                let old_world_from_camera = keyframe.tracked_from_world.inverse();
                 motions.extend(ledger::motion(&old_world_from_camera, world_from_camera).map(|motion| (keyframe.id, motion)));
-                keyframe.camera.camera_from_world = world_from_camera.inverse();
+                keyframe.track(world_from_camera.inverse());
             }
         }
         let moved = self.ledger.moved(&motions);
         self.cloud.transform(&self.gpu, &moved)?;
         Ok(moved.iter().map(|(run, _)| run.len()).sum())
+    }
+
+    /// What the images say of the window's poses, for the tracker; nothing unless poses are refined.
+    pub fn refined(&self) -> Vec<RefinedPair> {
+        if !self.config.refine_poses.enabled || self.keyframes.is_empty() {
+            return Vec::new();
+        }
+        refine_poses::pairs(&self.keyframes, &schedule::window(&self.keyframes, &self.config.window), &self.config.refine_poses)
     }
 
     /// The map as it is now.
@@ -230,6 +239,7 @@ impl Mapper {
             let config = (&self.config.window, &self.config.skip);
             let batch = session.next(BATCH, &self.keyframes, &mut self.rng, config);
             let reports = self.steps(&batch, None)?;
+            self.refine_poses(&window, &batch, &reports);
             psnr_sum += reports.iter().map(|r| r.loss.psnr_db()).sum::<f32>();
             done += batch.len();
             let losses: Vec<f32> = reports.iter().map(|r| r.loss.total(&self.config.loss)).collect();
@@ -239,6 +249,15 @@ impl Mapper {
         }
         let psnr_db = psnr_sum / done.max(1) as f32;
         Ok((done + self.score(&window)?, psnr_db))
+    }
+
+    /// Moves the window's keyframes down the gradients of the steps; the first keyframe is the world and stays.
+    fn refine_poses(&mut self, window: &[usize], batch: &[Step], reports: &[StepReport]) {
+        let config = &self.config.refine_poses;
+        let moves = |step: &Step| config.enabled && step.keyframe > 0 && window.contains(&step.keyframe);
+        for (step, report) in batch.iter().zip(reports).filter(|(step, _)| moves(step)) {
+            self.keyframes[step.keyframe].refine(&report.pose, step.pace, config);
+        }
     }
 
     /// A last step of each of some keyframes of the window, evenly spread over it, that scores the Gaussians; returns their number.

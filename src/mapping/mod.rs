@@ -9,6 +9,7 @@ mod limits;
 mod mapper;
 mod neighbours;
 mod points;
+mod refine_poses;
 mod schedule;
 mod seeding;
 
@@ -17,3 +18,4 @@ pub use density::{ClassicConfig, DensityConfig, DensityStrategy, VcdConfig};
 pub use keyframe::{Keyframe, KeyframeId};
 pub use limits::LimitsConfig;
 pub use mapper::{KeyframeReport, Mapper, MappingError, RefineReport, Refinement};
+pub use refine_poses::{RefinePosesConfig, RefinedPair};

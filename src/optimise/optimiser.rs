@@ -18,6 +18,8 @@ use crate::splat::{GaussianCloud, ViewCamera};
 pub struct StepReport {
     pub loss: LossTerms,
     pub counts: ViewCounts,
+    /// Gradient of the loss by the pose before the step, as in [`Gradients`].
+    pub pose: [f32; 6],
 }
 
 /// A view to learn from.
@@ -31,11 +33,12 @@ pub struct TrainingView<'a> {
     pub pace: f32,
 }
 
-/// What a step leaves behind on the GPU: sums of the loss, and the counters.
+/// What a step leaves behind on the GPU: sums of the loss, the gradient by the pose, and the counters.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 struct StepLog {
     loss: [f32; 4],
+    pose: [[f32; 4]; 2],
     counters: [Counter; COUNTERS as usize],
 }
 
@@ -140,7 +143,8 @@ impl Optimiser {
                 match rasterizer.counts(&entry.counters) {
                     Some(counts) => {
                         let pixels = views[i].target.width * views[i].target.height;
-                        reports[i] = StepReport { loss: LossTerms::from_sums(entry.loss, pixels), counts };
+                        let loss = LossTerms::from_sums(entry.loss, pixels);
+                        reports[i] = StepReport { loss, counts, pose: tangent(entry.pose) };
                     }
                     None => repeat.push(i),
                 }
@@ -171,8 +175,10 @@ impl Optimiser {
     fn encode_log(&self, encoder: &mut wgpu::CommandEncoder, rasterizer: &Rasterizer, log: &GpuBuffer, entry: usize) {
         let to = (entry * std::mem::size_of::<StepLog>()) as u64;
         let counters = &rasterizer.workspace.counters;
-        let counters_at = std::mem::offset_of!(StepLog, counters) as u64;
-        encoder.copy_buffer_to_buffer(self.loss_total.raw(), 0, log.raw(), to, counters_at);
+        let [pose_at, counters_at] =
+            [std::mem::offset_of!(StepLog, pose), std::mem::offset_of!(StepLog, counters)].map(|at| at as u64);
+        encoder.copy_buffer_to_buffer(self.loss_total.raw(), 0, log.raw(), to, pose_at);
+        encoder.copy_buffer_to_buffer(self.pose_gradient.raw(), 0, log.raw(), to + pose_at, counters_at - pose_at);
         encoder.copy_buffer_to_buffer(counters.raw(), 0, log.raw(), to + counters_at, counters.raw().size());
     }
 
@@ -222,9 +228,9 @@ impl Optimiser {
         let planes = (0..cloud.planes())
             .map(|plane| sink.read(&gpu, plane * cloud.capacity(), cloud.len()))
             .collect::<Result<Vec<_>, _>>()?;
-        let pose: Vec<[f32; 4]> = self.pose_gradient.read(&gpu, 0, 2)?;
-        let pose = [pose[0][0], pose[0][1], pose[0][2], pose[1][0], pose[1][1], pose[1][2]];
-        Ok(Gradients { loss: LossTerms::default(), cloud: cloud_from_planes(cloud.sh_degree(), &planes), pose })
+        let pose = self.pose_gradient.read(&gpu, 0, 2)?;
+        let cloud = cloud_from_planes(cloud.sh_degree(), &planes);
+        Ok(Gradients { loss: LossTerms::default(), cloud, pose: tangent([pose[0], pose[1]]) })
     }
 
     /// Submits one step and waits, again with larger buffers if its pairs did not fit.
@@ -287,14 +293,8 @@ impl Optimiser {
         self.loss_setup.write(gpu, 0, &[setup]);
         let forward = [width.div_ceil(LOSS_TILE), height.div_ceil(LOSS_TILE / 2), 1];
         let backward = [width.div_ceil(LOSS_TILE), height.div_ceil(LOSS_TILE), 1];
-        let inputs = [
-            (0, &self.loss_setup),
-            (1, &ws.color_depth),
-            (2, &ws.state),
-            (3, color),
-            (4, depth),
-            (5, &self.images[0].partials),
-        ];
+        let inputs =
+            [(0, &self.loss_setup), (1, &ws.color_depth), (2, &ws.state), (3, color), (4, depth), (5, &self.images[0].partials)];
         let with = |last| inputs.iter().copied().chain([last]).collect::<Vec<_>>();
         k.loss_forward.dispatch(gpu, pass, &with((6, &self.images[0].loss_sums)), forward);
         k.loss_reduce.dispatch(gpu, pass, &[(0, &self.images[0].loss_sums), (1, &self.loss_total)], [1, 1, 1]);
@@ -360,4 +360,9 @@ impl Optimiser {
         }
         Ok(())
     }
+}
+
+/// (ρ, θ) of a vector as the GPU keeps it: (ρ, 0), (θ, 0).
+fn tangent([[a, b, c, _], [d, e, f, _]]: [[f32; 4]; 2]) -> [f32; 6] {
+    [a, b, c, d, e, f]
 }

@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use crossbeam::channel::Receiver;
 
+use super::measurements::Teller;
 use super::messages::guarded;
 use super::{MapperMessage, PipelineError, Progress};
 use crate::gpu::Gpu;
@@ -33,6 +34,7 @@ pub(super) fn map(
     gpu: &Arc<Gpu>,
     config: &MappingConfig,
     messages: &Receiver<MapperMessage>,
+    tracker: &Teller,
     (progress, on_round): (&Progress, &mut dyn FnMut(Round<'_>)),
 ) -> MapSummary {
     let mut summary = MapSummary::default();
@@ -42,7 +44,7 @@ pub(super) fn map(
     };
     for message in messages.iter() {
         let stop = || progress.stopped() || (config.yields_to_keyframes && !messages.is_empty());
-        let done = guarded("mapping", || take(&mut mapper, message, &stop));
+        let done = guarded("mapping", || take(&mut mapper, message, tracker, &stop));
         match done {
             Ok(Taken { report, cloud }) => {
                 tracing::debug!(?report, "message taken");
@@ -70,7 +72,7 @@ struct Taken {
     cloud: Option<Arc<GaussianCloud>>,
 }
 
-fn take(mapper: &mut Mapper, message: MapperMessage, stop: &dyn Fn() -> bool) -> Result<Taken, PipelineError> {
+fn take(mapper: &mut Mapper, message: MapperMessage, tracker: &Teller, stop: &dyn Fn() -> bool) -> Result<Taken, PipelineError> {
     let (report, changed) = match message {
         MapperMessage::Points(points) => {
             mapper.add_points(&points, 0)?;
@@ -79,6 +81,7 @@ fn take(mapper: &mut Mapper, message: MapperMessage, stop: &dyn Fn() -> bool) ->
         MapperMessage::PoseUpdate(updates) => (None, mapper.update_poses(&updates)? > 0),
         MapperMessage::Keyframe(keyframe) => {
             let report = mapper.insert(&keyframe, stop)?;
+            tracker.tell(keyframe.id, &mapper.refined());
             (Some(report), report.seeded + report.iterations > 0)
         }
     };

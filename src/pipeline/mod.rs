@@ -4,6 +4,7 @@
 //! |---|---|---|
 //! | reader → tracker: [`Frame`](crate::sequence::Frame) | bounded channel | unpaced: waits; paced: the frame is dropped and counted |
 //! | tracker → mapper: [`MapperMessage`] | bounded channel | unpaced: waits; paced: the newest keyframe waits, older ones are counted as deferred |
+//! | mapper → tracker: how the images place keyframes | bounded channel | paced: dropped; unpaced it never is full, and the tracker waits for a fixed keyframe's |
 //! | mapper → viewers: [`MapSnapshot`](crate::splat::MapSnapshot) | single-slot queue | newest wins |
 //!
 //! No lock is taken on the per-frame path. A thread that panics ends its own work; what it had is still returned.
@@ -11,6 +12,7 @@
 mod budget;
 mod known_poses;
 mod map_thread;
+mod measurements;
 mod messages;
 pub mod outputs;
 mod read_thread;

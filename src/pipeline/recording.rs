@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 use crossbeam::channel::{bounded, unbounded};
 
 use super::map_thread::{self, MapSummary, Round};
+use super::measurements::{Listener, Teller};
 use super::{MapperMessage, PipelineError, Progress, known_poses, read_thread, track_thread};
 use crate::config::Config;
 use crate::geometry::Se3;
@@ -46,14 +47,17 @@ pub fn record(sequence: &Sequence, config: &Config, progress: &Progress) -> Resu
     let (frame_sender, frames) = bounded(FRAMES_AHEAD);
     let (message_sender, messages) = unbounded();
     let known_poses = config.replay.known_poses;
-    let follow = if known_poses { known_poses::follow } else { track_thread::track };
     let units_per_metre = if known_poses { known_poses::units_per_metre(sequence) } else { 1.0 };
     let track = std::thread::scope(|scope| {
         Builder::new()
             .name("reading".into())
             .spawn_scoped(scope, move || read_thread::read(sequence, false, &frame_sender, progress))
             .map_err(|source| PipelineError::Spawn { thread: "reading", source })?;
-        Ok::<_, PipelineError>(follow(sequence, config, &frames, &message_sender, progress))
+        Ok::<_, PipelineError>(if known_poses {
+            known_poses::follow(sequence, config, &frames, &message_sender, progress)
+        } else {
+            track_thread::track(sequence, config, &frames, &message_sender, Listener::default(), progress)
+        })
     })?;
     drop(message_sender);
     if let Some(error) = track.error {
@@ -88,7 +92,7 @@ impl Recording {
             paused += reached.elapsed();
         };
         let config = config.in_units(self.units_per_metre as f32);
-        let summary = map_thread::map(gpu, &config, &messages, (progress, &mut on_round));
+        let summary = map_thread::map(gpu, &config, &messages, &Teller::default(), (progress, &mut on_round));
         let MapSummary { cloud, step_ms, error, .. } = summary;
         let mapped = Mapped { cloud, wall_s: (started.elapsed() - paused).as_secs_f64(), steps: step_ms.len() };
         error.map_or(Ok(mapped), Err)

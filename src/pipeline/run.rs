@@ -8,6 +8,7 @@ use crossbeam::channel::bounded;
 
 use super::known_poses;
 use super::map_thread::{self, MapSummary};
+use super::measurements;
 use super::messages::guarded;
 use super::read_thread::{self, ReadSummary};
 use super::track_thread::{self, TrackSummary};
@@ -74,18 +75,24 @@ pub fn run(sequence: &Sequence, gpu: &Arc<Gpu>, config: &Config, progress: &Prog
     let paced = config.replay.paced;
     let (frame_sender, frames) = bounded(if paced { 1 } else { FRAMES_AHEAD });
     let (message_sender, messages) = bounded(MESSAGES_AHEAD);
-    let follow = if config.replay.known_poses { known_poses::follow } else { track_thread::track };
+    let (teller, listener) = measurements::channel(config);
     let mapping = &known_poses::mapping_config(sequence, config);
     let (read, track, map) = std::thread::scope(|scope| {
         let spawn_error = |thread| move |source| PipelineError::Spawn { thread, source };
         // A thread that cannot start drops its end of the channels, and the others end with it.
         let map = Builder::new()
             .name("mapping".into())
-            .spawn_scoped(scope, move || map_thread::map(gpu, mapping, &messages, (progress, &mut |_| ())))
+            .spawn_scoped(scope, move || map_thread::map(gpu, mapping, &messages, &teller, (progress, &mut |_| ())))
             .map_err(spawn_error("mapping"))?;
         let track = Builder::new()
             .name("tracking".into())
-            .spawn_scoped(scope, move || follow(sequence, config, &frames, &message_sender, progress))
+            .spawn_scoped(scope, move || {
+                if config.replay.known_poses {
+                    known_poses::follow(sequence, config, &frames, &message_sender, progress)
+                } else {
+                    track_thread::track(sequence, config, &frames, &message_sender, listener, progress)
+                }
+            })
             .map_err(spawn_error("tracking"))?;
         let read = Builder::new()
             .name("reading".into())

@@ -2,6 +2,7 @@
 
 use crossbeam::channel::{Receiver, Sender, TrySendError};
 
+use super::measurements::Listener;
 use super::messages::{TrackingProgress, guarded};
 use super::{MapperMessage, PipelineError, Progress};
 use crate::config::Config;
@@ -76,6 +77,7 @@ pub(super) fn track(
     config: &Config,
     frames: &Receiver<Frame>,
     mapper: &Sender<MapperMessage>,
+    mut listener: Listener,
     progress: &Progress,
 ) -> TrackSummary {
     let mut summary = TrackSummary::default();
@@ -98,7 +100,12 @@ pub(super) fn track(
         let lost = tracked.state == TrackingState::Lost;
         let (frames_done, keyframes) = (frame.index + 1, tracker.keyframes().len());
         progress.tracking.force_push(TrackingProgress { frames_done, keyframes, lost });
+        let keyframe = tracked.keyframe.as_ref().map(|k| k.id);
         if !sender.retry() || !hand_on(&mut sender, &rectifier, &frame, tracked) {
+            break;
+        }
+        if let Err(error) = tracker.measure(&listener.hear(keyframe)) {
+            summary.error = Some(error.into());
             break;
         }
     }

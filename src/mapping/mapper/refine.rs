@@ -53,11 +53,7 @@ impl Mapper {
     }
 
     /// The steps up to the next density control, and that; `None` when all are done, or `stop` says so.
-    pub fn refine(
-        &mut self,
-        refinement: &mut Refinement,
-        stop: &dyn Fn() -> bool,
-    ) -> Result<Option<RefineReport>, MappingError> {
+    pub fn refine(&mut self, refinement: &mut Refinement, stop: &dyn Fn() -> bool) -> Result<Option<RefineReport>, MappingError> {
         let RefineConfig { steps, density_every, growth_share, half_size_share, .. } = refinement.config;
         if refinement.done >= steps || self.cloud.is_empty() || self.keyframes.is_empty() || stop() {
             return Ok(None);
@@ -69,7 +65,8 @@ impl Mapper {
         let end = steps.min(refinement.done + density_every);
         while refinement.done < end && !stop() {
             let coarse = refinement.progress() < half_size_share;
-            let keyframes: Vec<usize> = (refinement.done..end.min(refinement.done + BATCH)).map(|_| self.draw_from(refinement)).collect();
+            let keyframes: Vec<usize> =
+                (refinement.done..end.min(refinement.done + BATCH)).map(|_| self.draw_from(refinement)).collect();
             let batch: Vec<Step> = keyframes.into_iter().map(|keyframe| Step { keyframe, coarse, pace: 1.0 }).collect();
             self.config.adam = refinement.rates();
             for report in self.steps(&batch, None)? {

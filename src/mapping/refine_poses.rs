@@ -1,0 +1,211 @@
+//! Keyframe poses refined by the images: each training step's gradient by the pose moves its keyframe by a step of Adam (as MonoGS does,
+//! Matsuki et al., *Gaussian Splatting SLAM*, CVPR 2024), bounded, and relative to where the tracker has it.
+//!
+//! The second moment is that of a whole vector's length, one for translation and one for rotation: a step then points along the averaged
+//! gradient whatever the axes, and weak directions are not blown up to the size of strong ones.
+
+use nalgebra::Vector6;
+use serde::{Deserialize, Serialize};
+
+use super::KeyframeId;
+use super::keyframe::MappedKeyframe;
+use crate::geometry::{Se3, se3};
+use crate::sequence::RectifiedImage;
+
+/// Decay of the first and the second moments.
+const BETA_1: f64 = 0.9;
+const BETA_2: f64 = 0.99;
+/// Below any gradient that means something.
+const EPSILON: f64 = 1e-12;
+/// A keyframe that took fewer steps is still where the tracker put it, and to say so would only repeat the tracker to itself.
+const MIN_STEPS: i32 = 8;
+
+/// Whether and how far keyframe poses follow the images.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RefinePosesConfig {
+    pub enabled: bool,
+    /// Whether the tracker is told the refined poses, as measurements of relative poses.
+    pub tell_tracker: bool,
+    /// Most that a step turns or shifts a keyframe: radians, metres.
+    pub rotation_rate: f64,
+    pub translation_rate: f64,
+    /// A step that would lead further than this from the tracker's pose is not taken: radians, metres.
+    pub max_turn_rad: f64,
+    pub max_shift_metres: f64,
+    /// Standard deviation of a refined relative pose, in pixels of the mapped image at the keyframe's median depth.
+    pub sigma_pixels: f64,
+}
+
+impl Default for RefinePosesConfig {
+    fn default() -> Self {
+        Self {
+            enabled: false,
+            tell_tracker: true,
+            rotation_rate: 1e-4,
+            translation_rate: 2e-4,
+            max_turn_rad: 0.01,
+            max_shift_metres: 0.02,
+            sigma_pixels: 0.1,
+        }
+    }
+}
+
+impl RefinePosesConfig {
+    /// Says what is wrong with the values, if anything.
+    pub(super) fn validate(&self) -> Result<(), String> {
+        let values = [
+            ("rotation_rate", self.rotation_rate),
+            ("translation_rate", self.translation_rate),
+            ("max_turn_rad", self.max_turn_rad),
+            ("max_shift_metres", self.max_shift_metres),
+        ];
+        if let Some((name, value)) = values.iter().find(|(_, value)| !(0.0..=1.0).contains(value)) {
+            return Err(format!("{name} must lie between 0 and 1, not {value}"));
+        }
+        if self.sigma_pixels.is_finite() && self.sigma_pixels > 0.0 {
+            Ok(())
+        } else {
+            Err("sigma_pixels must be positive".into())
+        }
+    }
+}
+
+/// How one keyframe's pose differs from the tracker's, and Adam's moments.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Refinement {
+    /// camera_from_world = refined_from_tracked · tracked_from_world
+    pub refined_from_tracked: Se3,
+    /// Mean of the gradient by (ρ, θ), and of its squared lengths.
+    mean: Vector6<f64>,
+    mean_squares: [f64; 2],
+    steps: i32,
+}
+
+impl Default for Refinement {
+    fn default() -> Self {
+        Self { refined_from_tracked: Se3::identity(), mean: Vector6::zeros(), mean_squares: [0.0; 2], steps: 0 }
+    }
+}
+
+impl Refinement {
+    /// One step down a loss's `gradient` by τ = (ρ, θ) of `camera_from_world ← Exp(τ)·camera_from_world`, taken where the refined pose
+    /// is; `pace` is a share of the rates. A gradient that is not finite says nothing.
+    pub fn step(&mut self, gradient: &[f32; 6], pace: f32, config: &RefinePosesConfig) {
+        let gradient = Vector6::from(gradient.map(f64::from));
+        if !gradient.iter().all(|g| g.is_finite()) {
+            return;
+        }
+        self.steps += 1;
+        self.mean = self.mean * BETA_1 + gradient * (1.0 - BETA_1);
+        let [unbiased_1, unbiased_2] = [BETA_1, BETA_2].map(|beta| 1.0 - beta.powi(self.steps));
+        let mut tau = -self.mean / unbiased_1;
+        for (k, rate) in [config.translation_rate, config.rotation_rate].into_iter().enumerate() {
+            let squared = gradient.fixed_rows::<3>(3 * k).norm_squared();
+            let mean_square = &mut self.mean_squares[k];
+            *mean_square = *mean_square * BETA_2 + squared * (1.0 - BETA_2);
+            let length = (*mean_square / unbiased_2).sqrt();
+            tau.fixed_rows_mut::<3>(3 * k).scale_mut(rate * f64::from(pace) / (length + EPSILON));
+        }
+        let mut refined = se3::exp(&tau) * self.refined_from_tracked;
+        refined.rotation.renormalize();
+        // NaN is within no bound.
+        if refined.translation.vector.norm() <= config.max_shift_metres && refined.rotation.angle() <= config.max_turn_rad {
+            self.refined_from_tracked = refined;
+        }
+    }
+}
+
+/// What the images say of two keyframes, in the terms of the tracker.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RefinedPair {
+    pub keyframe: KeyframeId,
+    pub relative_to: KeyframeId,
+    pub keyframe_from_relative: Se3,
+    /// Standard deviations of each coordinate of the translation, in the keyframe's frame, and of the rotation about each axis.
+    pub sigma_translation_metres: f64,
+    pub sigma_rotation_rad: f64,
+}
+
+/// The window's keyframes, each relative to the one of the window with which it shares most, where both have been refined.
+pub(super) fn pairs(keyframes: &[MappedKeyframe], window: &[usize], config: &RefinePosesConfig) -> Vec<RefinedPair> {
+    // The first keyframe is the world, and right by definition.
+    let refined = |k: usize| k == 0 || keyframes[k].refinement.steps >= MIN_STEPS;
+    let partner = |k: usize| {
+        let of_window = |id: &KeyframeId| window.iter().copied().find(|w| keyframes[*w].id == *id);
+        keyframes[k].covisible.iter().filter_map(of_window).find(|w| refined(*w))
+    };
+    let pair = |(k, other): (usize, usize)| {
+        let (keyframe, relative) = (&keyframes[k], &keyframes[other]);
+        let sigma_rotation_rad = config.sigma_pixels / keyframe.camera.pinhole.fx;
+        RefinedPair {
+            keyframe: keyframe.id,
+            relative_to: relative.id,
+            keyframe_from_relative: keyframe.camera.camera_from_world * relative.camera.camera_from_world.inverse(),
+            sigma_translation_metres: sigma_rotation_rad * keyframe.depth_metres,
+            sigma_rotation_rad,
+        }
+    };
+    window.iter().filter(|k| refined(**k)).filter_map(|k| Some((*k, partner(*k)?))).map(pair).collect()
+}
+
+/// Median of an image's measured depths, metres; 1 if there are none.
+pub(super) fn median_depth(image: &RectifiedImage) -> f64 {
+    let measured = image.depth.iter().flat_map(|depth| depth.metres.iter().copied().filter(|z| *z > 0.0));
+    let mut depths: Vec<f32> = measured.collect();
+    let middle = depths.len() / 2;
+    if depths.is_empty() { 1.0 } else { f64::from(*depths.select_nth_unstable_by(middle, f32::total_cmp).1) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::Vector3;
+
+    /// Squared errors of points that a camera sees: the least is where the camera is.
+    fn gradient(refined: &Se3, truth: &Se3) -> [f32; 6] {
+        let points = (0..40).map(|i| Vector3::new(f64::from(i % 8) - 3.5, f64::from(i / 8) - 2.0, 4.0 + f64::from(i % 3)) * 0.4);
+        let sum = points.fold(Vector6::zeros(), |sum, p| {
+            let (p, wanted) = (refined * nalgebra::Point3::from(p), truth * nalgebra::Point3::from(p));
+            let error = p - wanted;
+            let by_theta = p.coords.cross(&error);
+            sum + Vector6::new(error.x, error.y, error.z, by_theta.x, by_theta.y, by_theta.z)
+        });
+        std::array::from_fn(|k| sum[k] as f32)
+    }
+
+    #[test]
+    fn steps_lead_to_the_least_loss_and_not_beyond_the_bounds() {
+        let config = RefinePosesConfig { enabled: true, ..Default::default() };
+        let truth = se3::exp(&Vector6::new(0.004, -0.003, 0.002, 0.003, -0.002, 0.001));
+        let mut refinement = Refinement::default();
+        let distance = |r: &Refinement| se3::log(&(r.refined_from_tracked * truth.inverse())).norm();
+        let before = distance(&refinement);
+        for step in 0..800 {
+            refinement.step(&gradient(&refinement.refined_from_tracked, &truth), 1.0 - step as f32 / 800.0, &config);
+        }
+        assert!(distance(&refinement) < 0.05 * before, "{} of {before}", distance(&refinement));
+        let far = se3::exp(&Vector6::new(1.0, 0.0, 0.0, 0.0, 0.2, 0.0));
+        for _ in 0..1000 {
+            refinement.step(&gradient(&refinement.refined_from_tracked, &far), 1.0, &config);
+        }
+        let refined = refinement.refined_from_tracked;
+        assert!(refined.translation.vector.norm() <= config.max_shift_metres && refined.rotation.angle() <= config.max_turn_rad);
+        assert!(
+            refined.translation.vector.norm() > 0.9 * config.max_shift_metres
+                || refined.rotation.angle() > 0.9 * config.max_turn_rad
+        );
+    }
+
+    #[test]
+    fn nonsense_moves_nothing() {
+        let config = RefinePosesConfig { enabled: true, ..Default::default() };
+        let mut refinement = Refinement::default();
+        for gradient in [[f32::NAN; 6], [0.0, f32::INFINITY, 0.0, 0.0, 0.0, 0.0], [0.0; 6]] {
+            refinement.step(&gradient, 1.0, &config);
+        }
+        assert_eq!(refinement.refined_from_tracked, Se3::identity());
+        refinement.step(&[f32::MAX; 6], 1.0, &config);
+        assert!(se3::log(&refinement.refined_from_tracked).iter().all(|v| v.is_finite()));
+    }
+}
