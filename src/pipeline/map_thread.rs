@@ -43,7 +43,9 @@ pub(super) fn map(
             }
             MapperMessage::Keyframe(keyframe) => {
                 let report = mapper.insert(&keyframe, &|| progress.stopped())?;
-                tracker.tell(keyframe.id, &mapper.refined());
+                let refined = mapper.refined();
+                tracing::trace!(keyframe = keyframe.id, ?refined, "poses refined");
+                tracker.tell(keyframe.id, &refined);
                 Ok(Some((Some(report), Arc::new(mapper.download()?))))
             }
         });
