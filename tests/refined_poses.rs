@@ -1,13 +1,17 @@
 //! The mapper moves keyframes that came with a wrong pose to where their images say, the same to the bit each time.
 
+use std::sync::Arc;
+
 use image::{Rgb, RgbImage};
 use keysplat::geometry::{Pinhole, Se3, se3};
 use keysplat::gpu::Gpu;
 use keysplat::mapping::{Keyframe, Mapper, MappingConfig, RefinePosesConfig, RefinedPair};
 use keysplat::sequence::{DepthImage, RectifiedImage};
+use keysplat::splat::GaussianCloud;
 use nalgebra::{Point3, Vector3, Vector6};
 
 const PINHOLE: Pinhole = Pinhole { fx: 90.0, fy: 90.0, cx: 47.5, cy: 35.5, width: 96, height: 72 };
+const KEYFRAMES: usize = 6;
 const DISTURBED: usize = 3;
 
 /// A box before a wall: depth along z, and the point, that a ray from `eye` meets.
@@ -47,16 +51,24 @@ fn tracked(id: usize) -> Se3 {
     if id == DISTURBED { truth(id) * se3::exp(&wrong) } else { truth(id) }
 }
 
-fn refined(gpu: &std::sync::Arc<Gpu>, refine_poses: RefinePosesConfig) -> (Vec<RefinedPair>, keysplat::splat::GaussianCloud) {
+/// What a mapper makes of the walk: the refined poses and the map.
+fn refined(gpu: &Arc<Gpu>, refine_poses: RefinePosesConfig) -> (Vec<RefinedPair>, GaussianCloud) {
     let config = MappingConfig { iterations_per_keyframe: 60, refine_poses, ..Default::default() };
     let mut mapper = Mapper::new(gpu.clone(), &config).unwrap();
-    for id in 0..6 {
+    for id in 0..KEYFRAMES {
         let covisible = (0..id).rev().collect();
         mapper.insert(&Keyframe { id, world_from_camera: tracked(id), image: image(&truth(id)), covisible }, &|| false).unwrap();
     }
-    // The world may turn, cameras relative to each other may not.
-    assert_eq!(mapper.update_poses(&[(2, tracked(2))]).unwrap(), 0);
-    (mapper.refined(), mapper.download().unwrap())
+    let (pairs, map) = (mapper.refined(), mapper.download().unwrap());
+    // The tracker moves all that it knows, as after a loop: refinements go along, and so do the Gaussians.
+    let motion = se3::exp(&Vector6::new(0.5, -0.2, 0.1, 0.1, 0.3, -0.2));
+    let moved: Vec<_> = (0..KEYFRAMES).map(|id| (id, motion * tracked(id))).collect();
+    assert_eq!(mapper.update_poses(&moved).unwrap(), map.len());
+    for (before, after) in pairs.iter().zip(mapper.refined()) {
+        let difference = before.keyframe_from_relative * after.keyframe_from_relative.inverse();
+        assert!(se3::log(&difference).norm() < 1e-9 && before.relative_to == after.relative_to);
+    }
+    (pairs, map)
 }
 
 /// How far a pose of `keyframe` relative to `other` is from the truth: metres, radians.
@@ -75,7 +87,7 @@ fn a_disturbed_keyframe_returns_to_the_truth() {
         }
     };
     let off = RefinePosesConfig::default();
-    let on = RefinePosesConfig { enabled: true, rotation_rate: 3e-4, translation_rate: 6e-4, ..off.clone() };
+    let on = RefinePosesConfig { enabled: true, rotation_rate: 3e-4, translation_rate: 6e-4, pull: 0.0, ..off.clone() };
     assert!(refined(&gpu, RefinePosesConfig { enabled: false, ..off }).0.is_empty());
     let (pairs, map) = refined(&gpu, on.clone());
     assert!(pairs.len() >= 4, "{pairs:?}");

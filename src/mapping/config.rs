@@ -190,7 +190,9 @@ impl MappingConfig {
     /// For recordings whose poses are known: keyframes only arrive, and the refinement makes the map.
     pub fn offline() -> Self {
         let refine = RefineConfig { steps: 6000, ..RefineConfig::default() };
-        Self { iterations_per_keyframe: 0, first_iterations: 0, refine, ..Self::default() }
+        // Points and seeds lie further from where they belong than those of a depth image do.
+        let adam = AdamConfig { position_rate: 0.16, ..AdamConfig::default() };
+        Self { iterations_per_keyframe: 0, first_iterations: 0, refine, adam, ..Self::default() }
     }
 
     /// The same for a world whose unit is not the metre but `units_per_metre` to one: each length is given in that unit.

@@ -21,6 +21,10 @@ const EPSILON: f64 = 1e-12;
 const MIN_STEPS: i32 = 8;
 
 /// Whether and how far keyframe poses follow the images.
+///
+/// Off: in the few steps that a live map gets, refined poses come out only little truer than the tracker's from one keyframe to the next
+/// (1.64 against 1.81 mm, 0.55 against 0.65 mrad, on a room with noise and blur, mapped at a quarter of its size), and drift as a whole.
+/// Neither ATE nor held-out images gain (-0.2 dB).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RefinePosesConfig {
@@ -30,10 +34,14 @@ pub struct RefinePosesConfig {
     /// Most that a step turns or shifts a keyframe: radians, metres.
     pub rotation_rate: f64,
     pub translation_rate: f64,
+    /// Share of the way back to the tracker's pose that each step begins with: keeps the window from drifting off as a whole.
+    pub pull: f64,
     /// A step that would lead further than this from the tracker's pose is not taken: radians, metres.
     pub max_turn_rad: f64,
     pub max_shift_metres: f64,
-    /// Standard deviation of a refined relative pose, in pixels of the mapped image at the keyframe's median depth.
+    /// Standard deviation of a refined relative pose, in pixels of the mapped image at the keyframe's median depth. On a synthetic room
+    /// the refined poses are truer than that, by 0.07 pixels, but most of this is the tracker's own say coming back: at 0.1 it holds the
+    /// tracker from bettering itself (ATE +9%), at 0.3 hardly, at 1 not at all.
     pub sigma_pixels: f64,
 }
 
@@ -44,9 +52,10 @@ impl Default for RefinePosesConfig {
             tell_tracker: true,
             rotation_rate: 1e-4,
             translation_rate: 2e-4,
+            pull: 0.05,
             max_turn_rad: 0.01,
             max_shift_metres: 0.02,
-            sigma_pixels: 0.1,
+            sigma_pixels: 0.5,
         }
     }
 }
@@ -57,6 +66,7 @@ impl RefinePosesConfig {
         let values = [
             ("rotation_rate", self.rotation_rate),
             ("translation_rate", self.translation_rate),
+            ("pull", self.pull),
             ("max_turn_rad", self.max_turn_rad),
             ("max_shift_metres", self.max_shift_metres),
         ];
@@ -107,7 +117,8 @@ impl Refinement {
             let length = (*mean_square / unbiased_2).sqrt();
             tau.fixed_rows_mut::<3>(3 * k).scale_mut(rate * f64::from(pace) / (length + EPSILON));
         }
-        let mut refined = se3::exp(&tau) * self.refined_from_tracked;
+        let kept = se3::log(&self.refined_from_tracked) * (1.0 - config.pull);
+        let mut refined = se3::exp(&tau) * se3::exp(&kept);
         refined.rotation.renormalize();
         // NaN is within no bound.
         if refined.translation.vector.norm() <= config.max_shift_metres && refined.rotation.angle() <= config.max_turn_rad {
@@ -176,7 +187,7 @@ mod tests {
 
     #[test]
     fn steps_lead_to_the_least_loss_and_not_beyond_the_bounds() {
-        let config = RefinePosesConfig { enabled: true, ..Default::default() };
+        let config = RefinePosesConfig { enabled: true, pull: 0.0, ..Default::default() };
         let truth = se3::exp(&Vector6::new(0.004, -0.003, 0.002, 0.003, -0.002, 0.001));
         let mut refinement = Refinement::default();
         let distance = |r: &Refinement| se3::log(&(r.refined_from_tracked * truth.inverse())).norm();

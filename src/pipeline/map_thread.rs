@@ -81,7 +81,9 @@ fn take(mapper: &mut Mapper, message: MapperMessage, tracker: &Teller, stop: &dy
         MapperMessage::PoseUpdate(updates) => (None, mapper.update_poses(&updates)? > 0),
         MapperMessage::Keyframe(keyframe) => {
             let report = mapper.insert(&keyframe, stop)?;
-            tracker.tell(keyframe.id, &mapper.refined());
+            let refined = mapper.refined();
+            tracing::trace!(keyframe = keyframe.id, ?refined, "poses refined");
+            tracker.tell(keyframe.id, &refined);
             (Some(report), report.seeded + report.iterations > 0)
         }
     };
