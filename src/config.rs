@@ -134,7 +134,11 @@ impl Config {
 
     /// The same with single values changed, each written `key.of.value=value` as in TOML; a bare word counts as text. Checked.
     pub fn with_settings<S: AsRef<str>>(&self, settings: &[S]) -> Result<Self, ConfigError> {
-        let mut table = toml::Table::try_from(self).expect("a configuration is plain data");
+        if settings.is_empty() {
+            self.validate()?;
+            return Ok(self.clone());
+        }
+        let mut table = toml::Table::try_from(self).map_err(|e| ConfigError::Value(e.to_string()))?;
         for setting in settings.iter().map(AsRef::as_ref) {
             let wrong = |why: &str| ConfigError::Value(format!("`{setting}`: {why}"));
             let (key, value) = setting.split_once('=').ok_or_else(|| wrong("write key=value, like mapping.seed=1"))?;

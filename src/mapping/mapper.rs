@@ -233,9 +233,11 @@ impl Mapper {
             return Ok((0, 0.0));
         }
         let window = schedule::window(&self.keyframes, &self.config.window);
-        let mut session = Session::new(window.clone(), iterations);
+        // The scored steps are among the steps.
+        let scored = self.scoring().map_or(0, |_| self.config.density.views.min(window.len()).min(iterations));
+        let mut session = Session::new(window.clone(), iterations - scored);
         let (mut psnr_sum, mut done) = (0.0, 0);
-        while !stop() {
+        while iterations > scored && !stop() {
             let config = (&self.config.window, &self.config.skip);
             let batch = session.next(BATCH, &self.keyframes, &mut self.rng, config);
             let reports = self.steps(&batch, None)?;
