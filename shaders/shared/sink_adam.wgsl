@@ -26,7 +26,7 @@ var<private> corrections_of_harmonics: vec2<f32>;
 // Lane w of planes 1 and 3 is free; in the first moments these count the Gaussian's steps, of all and of its higher harmonics.
 fn begin_gradient(i: u32) {
     corrections = count_step(view.capacity + i);
-    if adam.step_harmonics == 1u {
+    if wants_harmonics() {
         corrections_of_harmonics = count_step(3u * view.capacity + i);
     }
 }
@@ -37,8 +37,9 @@ fn count_step(at: u32) -> vec2<f32> {
     return 1.0 / (1.0 - exp(steps * vec2(adam.log_beta_1, adam.log_beta_2)));
 }
 
+// The length never decides; see `coefficient_count`.
 fn wants_harmonics() -> bool {
-    return adam.step_harmonics == 1u;
+    return min(adam.step_harmonics, arrayLength(&parameters)) == 1u;
 }
 
 fn store_gradient(plane: u32, i: u32, raw: vec4<f32>) {

@@ -160,18 +160,17 @@ impl MappingConfig {
     /// For recordings whose poses are known: keyframes only arrive, and the refinement makes the map.
     pub fn offline() -> Self {
         let refine = RefineConfig { steps: 6000, ..RefineConfig::default() };
-        Self { iterations_per_keyframe: 0, first_iterations: 0, refine, ..Self::default() }
+        // Points and seeds lie further from where they belong than those of a depth image do.
+        let adam = AdamConfig { position_rate: 1.6e-3, ..AdamConfig::default() };
+        Self { iterations_per_keyframe: 0, first_iterations: 0, refine, adam, ..Self::default() }
     }
 
     /// The same for a world whose unit is not the metre but `units_per_metre` to one: each length is given in that unit.
     pub fn in_units(&self, units_per_metre: f32) -> Self {
         let mut scaled = self.clone();
         scaled.adam = self.adam.scaled(units_per_metre, 1.0);
-        let lengths = [
-            &mut scaled.density.max_scale_metres,
-            &mut scaled.seeding.min_depth_metres,
-            &mut scaled.seeding.max_depth_metres,
-        ];
+        let lengths =
+            [&mut scaled.density.max_scale_metres, &mut scaled.seeding.min_depth_metres, &mut scaled.seeding.max_depth_metres];
         lengths.into_iter().for_each(|length| *length *= units_per_metre);
         scaled.loss.depth_weight /= units_per_metre;
         scaled

@@ -74,7 +74,13 @@ fn slope(filled: &[f32], (width, height): (u32, u32), (x, y): (u32, u32), stride
 }
 
 /// A disc on the surface, as large as its block of pixels there.
-fn gaussian(keyframe: &Keyframe, (x, y): (u32, u32), (metres, slope): (f32, [f32; 2]), stride: u32, config: &SeedingConfig) -> Gaussian {
+fn gaussian(
+    keyframe: &Keyframe,
+    (x, y): (u32, u32),
+    (metres, slope): (f32, [f32; 2]),
+    stride: u32,
+    config: &SeedingConfig,
+) -> Gaussian {
     let pinhole = &keyframe.image.pinhole;
     let ray = pinhole.unproject(&Vector2::new(f64::from(x), f64::from(y)), 1.0);
     let p_in_world = keyframe.world_from_camera * Point3::from(ray * f64::from(metres));
@@ -92,7 +98,8 @@ fn gaussian(keyframe: &Keyframe, (x, y): (u32, u32), (metres, slope): (f32, [f32
     let across = normal.cross(&ray).try_normalize(1e-6).unwrap_or_else(|| normal.cross(&Vector3::y()).normalize());
     let tilt = normal.cross(&across);
     let axes = Rotation3::from_basis_unchecked(&[across, tilt, normal]);
-    let world_from_disc = (keyframe.world_from_camera.rotation * UnitQuaternion::from_rotation_matrix(&axes)).coords.map(|v| v as f32);
+    let world_from_disc =
+        (keyframe.world_from_camera.rotation * UnitQuaternion::from_rotation_matrix(&axes)).coords.map(|v| v as f32);
     let [qx, qy, qz, qw] = world_from_disc.into();
     let size = config.footprint * spacing_metres;
     let scale = Vec3::new(size, size / cosine as f32, size * config.thickness);

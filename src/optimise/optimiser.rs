@@ -301,14 +301,7 @@ impl Optimiser {
         self.loss_setup.write(gpu, 0, &[setup]);
         let forward = [width.div_ceil(LOSS_TILE), height.div_ceil(LOSS_TILE / 2), 1];
         let backward = [width.div_ceil(LOSS_TILE), height.div_ceil(LOSS_TILE), 1];
-        let inputs = [
-            (0, &self.loss_setup),
-            (1, &ws.color_depth),
-            (2, &ws.state),
-            (3, color),
-            (4, depth),
-            (5, &self.partials),
-        ];
+        let inputs = [(0, &self.loss_setup), (1, &ws.color_depth), (2, &ws.state), (3, color), (4, depth), (5, &self.partials)];
         let with = |last| inputs.iter().copied().chain([last]).collect::<Vec<_>>();
         k.loss_forward.dispatch(gpu, pass, &with((6, &self.loss_sums)), forward);
         k.loss_reduce.dispatch(gpu, pass, &[(0, &self.loss_sums), (1, &self.loss_total)], [1, 1, 1]);

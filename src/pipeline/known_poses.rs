@@ -96,11 +96,7 @@ fn thinned_points(sequence: &Sequence, config: &Config) -> Vec<KnownPoint> {
 
 /// The mapper's configuration for a recording.
 pub(super) fn mapping_config(sequence: &Sequence, config: &Config) -> MappingConfig {
-    if config.replay.known_poses {
-        config.mapping.in_units(units_per_metre(sequence) as f32)
-    } else {
-        config.mapping.clone()
-    }
+    if config.replay.known_poses { config.mapping.in_units(units_per_metre(sequence) as f32) } else { config.mapping.clone() }
 }
 
 /// A keyframe so far.

@@ -112,7 +112,8 @@ fn held_out(
     let is_held_out = |index: usize| config.replay.is_held_out(index);
     let poses: Vec<_> = recording.poses.iter().filter(|(index, _)| is_held_out(*index)).copied().collect();
     let selection = ViewSelection { poses: &poses, keyframes: &BTreeSet::new(), is_held_out: &is_held_out };
-    let images = evaluate_views((sequence, config.map_scale), (gpu, cloud), &selection, &mut |_| (), &|_| ()).into_diagnostic()?;
+    let images =
+        evaluate_views((sequence, config.map_scale), (gpu, cloud), &selection, &mut |_| (), &|_| ()).into_diagnostic()?;
     Ok(images.held_out)
 }
 

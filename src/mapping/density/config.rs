@@ -120,12 +120,20 @@ impl DensityConfig {
             return Err("views must be at least 1".into());
         }
         let (v, c) = (&self.vcd, &self.classic);
-        let shares =
-            [("min_opacity", self.min_opacity), ("vcd.min_weight", v.min_weight), ("vcd.faint_opacity", v.faint_opacity), ("vcd.noise", v.noise)];
+        let shares = [
+            ("min_opacity", self.min_opacity),
+            ("vcd.min_weight", v.min_weight),
+            ("vcd.faint_opacity", v.faint_opacity),
+            ("vcd.noise", v.noise),
+        ];
         if let Some((name, value)) = shares.iter().find(|(_, value)| !(0.0..1.0).contains(value)) {
             return Err(format!("{name} must lie between 0 and 1, not {value}"));
         }
-        let positive = [("max_scale_metres", self.max_scale_metres), ("vcd.split_pixels", v.split_pixels), ("classic.split_pixels", c.split_pixels)];
+        let positive = [
+            ("max_scale_metres", self.max_scale_metres),
+            ("vcd.split_pixels", v.split_pixels),
+            ("classic.split_pixels", c.split_pixels),
+        ];
         if let Some((name, value)) = positive.iter().find(|(_, value)| !(value.is_finite() && *value > 0.0)) {
             return Err(format!("{name} must be positive, not {value}"));
         }

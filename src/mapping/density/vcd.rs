@@ -4,7 +4,7 @@
 //! Unlike the released code: pruning is decided first and by order of score, without a draw; a pixel is wrong by a multiple of the mean
 //! error, not by the view's extremes; ages are per Gaussian.
 
-use super::{Candidate, Verdict, VcdConfig};
+use super::{Candidate, VcdConfig, Verdict};
 
 /// Views that must have shown a Gaussian before it can be called useless.
 const MIN_VIEWS: u32 = 3;

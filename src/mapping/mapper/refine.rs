@@ -64,11 +64,7 @@ impl Mapper {
     }
 
     /// The steps up to the next density control, and that; `None` when all are done, or `stop` says so.
-    pub fn refine(
-        &mut self,
-        refinement: &mut Refinement,
-        stop: &dyn Fn() -> bool,
-    ) -> Result<Option<RefineReport>, MappingError> {
+    pub fn refine(&mut self, refinement: &mut Refinement, stop: &dyn Fn() -> bool) -> Result<Option<RefineReport>, MappingError> {
         let RefineConfig { steps, density_every, growth_share, half_size_share, .. } = refinement.config;
         if refinement.done >= steps || self.cloud.is_empty() || self.keyframes.is_empty() || stop() {
             return Ok(None);
@@ -84,7 +80,8 @@ impl Mapper {
         let mut psnr = (0.0, 0);
         let end = steps.min(refinement.done + density_every);
         while refinement.done < end && !stop() {
-            let batch: Vec<usize> = (refinement.done..end.min(refinement.done + BATCH)).map(|_| self.draw_from(refinement)).collect();
+            let batch: Vec<usize> =
+                (refinement.done..end.min(refinement.done + BATCH)).map(|_| self.draw_from(refinement)).collect();
             self.config.adam = refinement.rates();
             for (report, &index) in self.steps(&batch, None)?.iter().zip(&batch) {
                 if !report.loss.total(&self.config.loss).is_finite() {
