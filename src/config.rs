@@ -117,8 +117,13 @@ impl Config {
     }
 
     /// Reads and checks a TOML file; keys that it leaves out keep their defaults, unknown ones are errors. The defaults are those of
-    /// [`Self::offline`] if `known_poses`, or the file, says so.
-    pub fn read(path: &Path, known_poses: bool) -> Result<Self, ConfigError> {
+    /// [`Self::offline`] if the file says that poses are known.
+    pub fn read(path: &Path) -> Result<Self, ConfigError> {
+        Self::read_with(path, false)
+    }
+
+    /// The same; `known_poses` says it, whatever the file does.
+    pub fn read_with(path: &Path, known_poses: bool) -> Result<Self, ConfigError> {
         let text = std::fs::read_to_string(path).map_err(|source| ConfigError::Read { path: path.into(), source })?;
         let syntax = |source| ConfigError::Syntax { path: path.into(), source: Box::new(source) };
         let mut config: Self = toml::from_str(&text).map_err(syntax)?;
@@ -203,7 +208,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("run.toml");
         std::fs::write(&path, "map_scale = 0.5\n[mapping.loss]\nssim_wieght = 0.1\n").unwrap();
-        let message = Config::read(&path, false).unwrap_err().to_string();
+        let message = Config::read(&path).unwrap_err().to_string();
         assert!(message.contains("run.toml") && message.contains("line 3") && message.contains("ssim_wieght"), "{message}");
         let wrong = |text: &str| toml::from_str::<Config>(text).unwrap().validate().unwrap_err().to_string();
         assert!(wrong("map_scale = 2.0").contains("map_scale"));
@@ -216,12 +221,12 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("run.toml");
         std::fs::write(&path, "[mapping.refine]\ndensity_every = 70\n").unwrap();
-        let offline = Config::read(&path, true).unwrap();
+        let offline = Config::read_with(&path, true).unwrap();
         assert_eq!((offline.mapping.refine.density_every, offline.replay.known_poses), (70, true));
         assert_eq!(offline.mapping.refine.steps, MappingConfig::offline().refine.steps);
-        assert_eq!(Config::read(&path, false).unwrap().mapping.refine.steps, 0);
+        assert_eq!(Config::read(&path).unwrap().mapping.refine.steps, 0);
         std::fs::write(&path, offline.to_toml()).unwrap();
-        assert_eq!(Config::read(&path, false).unwrap(), offline);
+        assert_eq!(Config::read(&path).unwrap(), offline);
     }
 
     #[test]

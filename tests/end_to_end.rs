@@ -83,7 +83,7 @@ fn a_run_writes_everything() {
     assert!((0.5..25.0).contains(&difference(WIDTH)), "right is a render, {} levels off", difference(WIDTH));
     let every_frame: Vec<String> = (0..FRAMES).map(stamp).collect();
     assert_eq!(stamps(&out.join("trajectory.txt")), every_frame);
-    let config = Config::read(&out.join("config.toml"), false).unwrap();
+    let config = Config::read(&out.join("config.toml")).unwrap();
     assert_eq!(config.sequence.unwrap().path, recording());
 }
 
@@ -149,7 +149,7 @@ fn figures_are_true_of_what_was_written() {
     assert!(0.0 < step.median && step.median <= step.p95);
     assert!(0.0 < tracking.median && tracking.median <= tracking.p95 && tracking.p95 <= tracking.max);
     assert!(m.wall_s.unwrap() * 1e3 > step.median && m.peak_gpu_bytes.unwrap() > map.len() as u64);
-    let config = Config::read(&out.join("config.toml"), false).unwrap();
+    let config = Config::read(&out.join("config.toml")).unwrap();
     assert_eq!(m.config_hash, Some(sha256(config.identity().as_bytes())));
     assert_eq!(m.version, env!("CARGO_PKG_VERSION"));
 }
@@ -217,7 +217,7 @@ fn frames_and_every_select() {
     // A range without an end is written with the one it has.
     let out = run("selected", recording(), &["--frames", "20.."]);
     assert_eq!(stamps(&out.join("trajectory.txt")), (20..FRAMES).map(stamp).collect::<Vec<_>>());
-    assert_eq!(Config::read(&out.join("config.toml"), false).unwrap().replay.frames, Some((20, FRAMES)));
+    assert_eq!(Config::read(&out.join("config.toml")).unwrap().replay.frames, Some((20, FRAMES)));
 }
 
 #[test]

@@ -110,7 +110,7 @@ fn a_video_is_tracked_mapped_and_measured_again() {
     assert!(run.frames_tracked >= 8, "{} frames tracked", run.frames_tracked);
     let on_the_grid = |stamp: &String| (stamp.parse::<f64>().unwrap() * VIDEO_FPS + 1e-3).fract() < 2e-3;
     assert!(stamps(&out.join("trajectory.txt")).iter().all(on_the_grid));
-    let named = Config::read(&out.join("config.toml"), false).unwrap().sequence.unwrap();
+    let named = Config::read(&out.join("config.toml")).unwrap().sequence.unwrap();
     assert_eq!((named.path, named.camera.as_deref()), (video, calibration.to_str()));
     // Later, and from elsewhere: the same frames again.
     finish(keysplat([Path::new("eval"), &out])).succeeded();

@@ -31,7 +31,7 @@ fn begin_gradient(i: u32) {
     let log_scale = parameters[view.capacity + i];
     size = min(exp((log_scale.x + log_scale.y + log_scale.z) / 3.0), 1e3);
     corrections = count_step(view.capacity + i);
-    if adam.step_harmonics == 1u {
+    if wants_harmonics() {
         corrections_of_harmonics = count_step(3u * view.capacity + i);
     }
 }
@@ -42,8 +42,9 @@ fn count_step(at: u32) -> vec2<f32> {
     return 1.0 / (1.0 - exp(steps * vec2(adam.log_beta_1, adam.log_beta_2)));
 }
 
+// The length never decides; see `coefficient_count`.
 fn wants_harmonics() -> bool {
-    return adam.step_harmonics == 1u;
+    return min(adam.step_harmonics, arrayLength(&parameters)) == 1u;
 }
 
 fn store_gradient(plane: u32, i: u32, raw: vec4<f32>) {

@@ -177,7 +177,7 @@ struct RecordedView {
 
 impl RecordedView {
     fn open(dir: &Path) -> miette::Result<Self> {
-        let mut config = Config::read(&dir.join(outputs::CONFIG), false).into_diagnostic()?;
+        let mut config = Config::read(&dir.join(outputs::CONFIG)).into_diagnostic()?;
         let sequence = run::open(&mut config)?;
         let keyframes = Trajectory::read_tum(&dir.join(outputs::KEYFRAMES)).into_diagnostic()?;
         let middle =

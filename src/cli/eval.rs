@@ -82,7 +82,7 @@ pub fn eval(args: &EvalArgs, verbosity: Verbosity) -> miette::Result<()> {
 
 fn resolve(args: &EvalArgs) -> miette::Result<Config> {
     let own = args.dir.join(outputs::CONFIG);
-    let mut config = if own.is_file() { Config::read(&own, false).into_diagnostic()? } else { Config::default() };
+    let mut config = if own.is_file() { Config::read(&own).into_diagnostic()? } else { Config::default() };
     if let Some(path) = &args.sequence {
         let (layout, sensor, camera) = config.sequence.take().map_or((None, None, None), |s| (s.layout, s.sensor, s.camera));
         config.sequence = Some(SequenceConfig { path: path.clone(), layout, sensor, camera });

@@ -120,7 +120,7 @@ fn parse_range(text: &str) -> Result<(usize, usize), String> {
 impl RunArgs {
     pub fn resolve(&self) -> miette::Result<Config> {
         let mut config = match &self.config {
-            Some(path) => Config::read(path, self.known_poses).into_diagnostic()?,
+            Some(path) => Config::read_with(path, self.known_poses).into_diagnostic()?,
             None if self.known_poses => Config::offline(),
             None => Config::default(),
         };
