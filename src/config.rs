@@ -139,7 +139,10 @@ impl Config {
 
     /// The same with single values changed, each written `key.of.value=value` as in TOML; a bare word counts as text. Checked.
     pub fn with_settings<S: AsRef<str>>(&self, settings: &[S]) -> Result<Self, ConfigError> {
-        let mut table = toml::Table::try_from(self).expect("a configuration is plain data");
+        // TOML's integers end where an open range of frames does not.
+        let mut plain = self.clone();
+        plain.replay.frames = self.replay.frames.map(|(start, end)| (start, end.min(i64::MAX as usize)));
+        let mut table = toml::Table::try_from(plain).expect("a configuration is plain data");
         for setting in settings.iter().map(AsRef::as_ref) {
             let wrong = |why: &str| ConfigError::Value(format!("`{setting}`: {why}"));
             let (key, value) = setting.split_once('=').ok_or_else(|| wrong("write key=value, like mapping.seed=1"))?;
