@@ -10,8 +10,9 @@
 @group(0) @binding(4) var<storage, read> target_depth: array<f32>;
 // [3 channels, bordered H, bordered W] ∂SSIM/∂(mean, mean square, mean product), zero on the border.
 @group(0) @binding(5) var<storage, read_write> partials: array<vec4<f32>>;
-// [workgroups] sums of |colour error|, SSIM, |depth error|, squared colour error.
+// [tiles] sums of |colour error|, SSIM, |depth error|, squared colour error; a tile left out keeps those it had.
 @group(0) @binding(6) var<storage, read_write> loss_sums: array<vec4<f32>>;
+@group(0) @binding(7) var<uniform> skipped: SkippedTiles;
 
 const C1: f32 = 0.0001;
 const C2: f32 = 0.0009;
@@ -27,7 +28,7 @@ struct Ssim {
     by_product: vec4<f32>,
 }
 
-// A workgroup covers 16×8 pixels.
+// A workgroup covers a tile, 16×8 pixels. Windows around the pixels of a tile that is left out do not count.
 @compute @workgroup_size(32)
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
@@ -35,6 +36,11 @@ fn main(
     @builtin(local_invocation_index) local: u32,
 ) {
     let first = vec2(workgroup.x * 16u, workgroup.y * 8u);
+    let tile = workgroup.y * workgroups.x + workgroup.x;
+    if is_bit_set(skipped.bits[tile / 128u % 1024u], tile) {
+        clear_partials(first, local);
+        return;
+    }
     for (var item = local; item < 72u; item += 32u) {
         filter_row(first, item / 4u, item % 4u * 4u);
     }
@@ -80,7 +86,21 @@ fn main(
         }
     }
     if local == 0u {
-        loss_sums[workgroup.y * workgroups.x + workgroup.x] = sums[0];
+        loss_sums[tile] = sums[0];
+    }
+}
+
+fn clear_partials(first: vec2<u32>, local: u32) {
+    let stride = bordered(setup.width);
+    let plane = stride * bordered(setup.height);
+    for (var i = local; i < 128u; i += 32u) {
+        let pixel = first + vec2(i % 16u, i / 16u);
+        if pixel.x < setup.width && pixel.y < setup.height {
+            let to = (pixel.y + RADIUS) * stride + pixel.x + RADIUS;
+            partials[to] = vec4(0.0);
+            partials[plane + to] = vec4(0.0);
+            partials[2u * plane + to] = vec4(0.0);
+        }
     }
 }
 

@@ -21,6 +21,7 @@ struct TileListsSetup {
 @group(0) @binding(8) var<storage, read_write> slots: array<u32>;
 // [pairs] Gaussian of each slot.
 @group(0) @binding(9) var<storage, read_write> slot_gaussians: array<u32>;
+@group(0) @binding(10) var<uniform> skipped: SkippedTiles;
 
 // Slack for rounding, absolute and relative: a tile too many costs time, one too few a seam.
 const SLACK: f32 = 1e-3;
@@ -54,11 +55,15 @@ fn main(
     }
     for (var y = low.y; y <= high.y; y++) {
         for (var x = low.x; x <= high.x; x++) {
+            let tile = y * view.tiles_x + x;
+            if is_bit_set(skipped.bits[tile / 128u % 1024u], tile) {
+                continue;
+            }
             if !touches(mean, whitening, limit, vec2(f32(x), f32(y)) * tile_size, tile_size - 1.0) {
                 continue;
             }
             if emit {
-                tile_keys[slot + found] = y * view.tiles_x + x;
+                tile_keys[slot + found] = tile;
                 slots[slot + found] = slot + found;
                 slot_gaussians[slot + found] = gaussian;
             }

@@ -62,7 +62,7 @@ fn scores_are_those_of_their_definition() {
         let mut on_gpu = GpuCloud::new(&gpu, cloud.sh_degree, cloud.len()).unwrap();
         on_gpu.append(&gpu, &cloud).unwrap();
         let target = TargetImage::new(&gpu, &image, None).unwrap();
-        let view = TrainingView { camera, target: &target, scored: Some(wrong_config), pace: 1.0 };
+        let view = TrainingView { camera, target: &target, scored: Some(wrong_config), pace: 1.0, skip: None };
         optimiser.begin_scores(&gpu, &on_gpu).unwrap();
         optimiser.steps(&mut rasterizer, &on_gpu, &[view; 2], (&loss_config, &still())).unwrap();
         let found = optimiser.read_scores(&gpu, &on_gpu).unwrap();

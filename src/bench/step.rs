@@ -10,7 +10,7 @@ use super::rates::Rates;
 use super::scene::BenchScene;
 use super::work::{Work, count_work};
 use crate::gpu::{Gpu, GpuError};
-use crate::optimise::{AdamConfig, LossConfig, Optimiser, TrainingView};
+use crate::optimise::{AdamConfig, LossConfig, Optimiser, TileSkip, TrainingView};
 use crate::render::{BlendForm, Rasterizer};
 use crate::splat::ShDegree;
 
@@ -23,6 +23,8 @@ pub struct StepBench {
     pub sh_degree: ShDegree,
     /// Form of the blending passes.
     pub form: BlendForm,
+    /// Tiles that the steps leave out, if any.
+    pub skip: Option<TileSkip>,
     /// Timed steps; a few untimed ones precede them.
     pub steps: usize,
 }
@@ -64,6 +66,7 @@ pub struct StepRunner {
     rasterizer: Rasterizer,
     optimiser: Optimiser,
     still: AdamConfig,
+    skip: Option<TileSkip>,
     /// The work in one step.
     pub work: Work,
 }
@@ -81,7 +84,7 @@ pub struct StepTimes {
 
 impl StepRunner {
     /// `gpu` should be opened with [`Gpu::open_profiled`]. Compiles and warms up.
-    pub fn new(gpu: &Arc<Gpu>, scene: BenchScene, form: BlendForm) -> Result<Self, GpuError> {
+    pub fn new(gpu: &Arc<Gpu>, scene: BenchScene, form: BlendForm, skip: Option<TileSkip>) -> Result<Self, GpuError> {
         let mut rasterizer = Rasterizer::with_form(gpu.clone(), form)?;
         let optimiser = Optimiser::new(&rasterizer)?;
         let work = count_work(&mut rasterizer, &scene.cloud, &scene.camera)?;
@@ -95,7 +98,7 @@ impl StepRunner {
             harmonics_rate: 0.0,
             ..AdamConfig::default()
         };
-        let mut runner = Self { gpu: gpu.clone(), scene, rasterizer, optimiser, still, work };
+        let mut runner = Self { gpu: gpu.clone(), scene, rasterizer, optimiser, still, skip, work };
         for _ in 0..WARM_UP {
             runner.steps(1)?;
         }
@@ -104,7 +107,8 @@ impl StepRunner {
     }
 
     fn steps(&mut self, count: usize) -> Result<(), GpuError> {
-        let views = [TrainingView { camera: self.scene.camera, target: &self.scene.target, scored: None, pace: 1.0 }; BATCH];
+        let (camera, target, skip) = (self.scene.camera, &self.scene.target, self.skip);
+        let views = [TrainingView { camera, target, scored: None, pace: 1.0, skip }; BATCH];
         let configs = (&LossConfig::default(), &self.still);
         self.optimiser.steps(&mut self.rasterizer, &self.scene.cloud, &views[..count], configs)?;
         Ok(())
@@ -129,7 +133,7 @@ impl StepRunner {
 
 /// Measures a training step on a scene.
 pub fn bench_step(gpu: &Arc<Gpu>, scene: BenchScene, bench: &StepBench, rates: &Rates) -> Result<StepReport, GpuError> {
-    let mut runner = StepRunner::new(gpu, scene, bench.form)?;
+    let mut runner = StepRunner::new(gpu, scene, bench.form, bench.skip)?;
     let times = (0..bench.steps.div_ceil(BATCH)).map(|_| runner.run()).collect::<Result<Vec<_>, _>>()?;
     let ms = |part: &dyn Fn(&StepTimes) -> Duration| {
         let mut all: Vec<f64> = times.iter().map(|t| part(t).as_secs_f64() * 1e3).collect();

@@ -10,6 +10,7 @@ use keysplat::config::Config;
 use keysplat::export::MapFormat;
 use keysplat::geometry::{Pinhole, Se3, Trajectory};
 use keysplat::gpu::{AdapterSummary, Gpu, GpuError};
+use keysplat::optimise::TileSkip;
 use keysplat::pipeline::outputs;
 use keysplat::render::BlendForm;
 use keysplat::sequence::{RectifiedImage, Rectifier};
@@ -50,6 +51,9 @@ struct StepArgs {
     /// Form of the blending passes: the adapter's own by default.
     #[arg(long, value_enum)]
     form: Option<Form>,
+    /// Leave tiles out as `mapping.skip.tile_share` does, with a tenth as the least.
+    #[arg(long)]
+    tile_share: Option<f32>,
     /// Timed steps per scene.
     #[arg(long, default_value_t = 12)]
     steps: usize,
@@ -108,6 +112,7 @@ pub fn bench(args: &BenchArgs) -> miette::Result<()> {
 fn step(args: &StepArgs) -> miette::Result<()> {
     let gpu = Gpu::open_profiled(args.adapter.as_deref()).into_diagnostic()?;
     let rates = measure_rates(&gpu).into_diagnostic()?;
+    let skip = args.tile_share.map(|share| TileSkip { share, least: 0.1, noise: 0.0 });
     let form = args.form.map_or(BlendForm::of(&gpu), BlendForm::from);
     let mut report = Report {
         adapter: gpu.adapter.clone(),
@@ -147,14 +152,14 @@ fn step(args: &StepArgs) -> miette::Result<()> {
             let depth = view.image.depth.as_ref().map(|depth| depth.metres.as_slice());
             let scene = BenchScene::of_map(&gpu, &cloud, camera, (&view.image.color, depth));
             let sh_degree = cloud.sh_degree;
-            measure(scene, StepBench { gaussians: cloud.len(), width, height, sh_degree, form, steps: args.steps })?;
+            measure(scene, StepBench { gaussians: cloud.len(), width, height, sh_degree, form, skip, steps: args.steps })?;
             continue;
         }
         for &(width, height) in &args.size {
             for &degree in &args.sh {
                 let sh_degree = ShDegree::new(degree).ok_or_else(|| miette!("--sh takes degrees 0 to 3, not {degree}"))?;
                 let scene = BenchScene::new(&gpu, gaussians, (width, height), sh_degree);
-                measure(scene, StepBench { gaussians, width, height, sh_degree, form, steps: args.steps })?;
+                measure(scene, StepBench { gaussians, width, height, sh_degree, form, skip, steps: args.steps })?;
             }
         }
     }

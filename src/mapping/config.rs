@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::{DensityConfig, LimitsConfig, RefinePosesConfig};
-use crate::optimise::{AdamConfig, LossConfig};
+use crate::optimise::{AdamConfig, LossConfig, TileSkip};
 use crate::splat::ShDegree;
 
 /// The mapper's configuration.
@@ -85,11 +85,26 @@ pub struct SkipConfig {
     pub coarse_share: f32,
     /// The steps after a keyframe end when ten of them lower the loss of their views by less than this share; 0: never.
     pub min_gain: f32,
+    /// A tile whose loss is its view's mean is worked on in this share of the view's steps, one of more or less loss in proportion more
+    /// or less often; 1 and `tile_least` 1: all tiles in all steps.
+    pub tile_share: f32,
+    /// Least share of the steps that a tile is worked on.
+    pub tile_least: f32,
+    /// Loss per pixel below which a tile is worked on no more often than that.
+    pub tile_noise: f32,
+}
+
+impl SkipConfig {
+    /// Which tiles the steps leave out, if any.
+    pub fn tiles(&self) -> Option<TileSkip> {
+        let Self { tile_share: share, tile_least: least, tile_noise: noise, .. } = *self;
+        (least < 1.0).then_some(TileSkip { share, least, noise })
+    }
 }
 
 impl Default for SkipConfig {
     fn default() -> Self {
-        Self { draw_by_loss: true, coarse_share: 0.0, min_gain: 0.01 }
+        Self { draw_by_loss: true, coarse_share: 0.0, min_gain: 0.01, tile_share: 0.5, tile_least: 0.1, tile_noise: 0.0 }
     }
 }
 
@@ -97,11 +112,11 @@ impl Default for SkipConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SeedingConfig {
-    /// One seed per `stride`² pixels where the image has detail, and per `flat_stride`² where it is flat.
+    /// One seed per `stride`² pixels where the image has most detail, and per `flat_stride`² where it is flat.
     pub stride: u32,
     pub flat_stride: u32,
-    /// Mean colour gradient (0 to 1, per pixel) of a block above which it has detail.
-    pub detail_gradient: f32,
+    /// Standard deviation of a block's colours (0 to 1) above which the block is quartered.
+    pub detail: f32,
     /// A pixel whose alpha is below this lacks map.
     pub min_alpha: f32,
     /// A pixel whose measured depth is nearer than the map's by this share of itself shows something that the map lacks.
@@ -121,8 +136,8 @@ impl Default for SeedingConfig {
     fn default() -> Self {
         Self {
             stride: 2,
-            flat_stride: 4,
-            detail_gradient: 0.02,
+            flat_stride: 8,
+            detail: 0.05,
             min_alpha: 0.6,
             depth_disagreement: 0.06,
             footprint: 0.55,
@@ -213,8 +228,10 @@ impl MappingConfig {
     /// Says what is wrong with the values, if anything.
     pub fn validate(&self) -> Result<(), String> {
         let s = &self.seeding;
-        if s.stride == 0 || s.flat_stride < s.stride || !s.flat_stride.is_multiple_of(s.stride) {
-            return Err("mapping.seeding.flat_stride must be a multiple of mapping.seeding.stride, both at least 1".into());
+        if !(s.stride.is_power_of_two() && s.flat_stride.is_power_of_two() && s.stride <= s.flat_stride && s.flat_stride <= 64) {
+            return Err(
+                "mapping.seeding.stride and flat_stride must be powers of two up to 64, flat_stride the larger one".into()
+            );
         }
         let shares = [
             ("window.older_share", self.window.older_share),
@@ -222,6 +239,7 @@ impl MappingConfig {
             ("skip.min_gain", self.skip.min_gain),
             ("seeding.min_alpha", s.min_alpha),
             ("seeding.opacity", s.opacity),
+            ("seeding.detail", s.detail),
             ("points.opacity", self.points.opacity),
         ];
         if let Some((name, value)) = shares.iter().find(|(_, value)| !(0.0..1.0).contains(value)) {

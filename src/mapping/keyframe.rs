@@ -5,7 +5,7 @@ use image::{Rgb, RgbImage};
 use super::refine_poses::{RefinePosesConfig, Refinement, median_depth};
 use crate::geometry::{Pinhole, Se3};
 use crate::gpu::{Gpu, GpuError};
-use crate::optimise::{TargetImage, TrainingView, WrongPixels};
+use crate::optimise::{TargetImage, TileSkip, TrainingView, WrongPixels};
 use crate::sequence::{DepthImage, RectifiedImage};
 use crate::splat::ViewCamera;
 
@@ -98,13 +98,18 @@ impl MappedKeyframe {
     }
 
     /// What a step learns from; coarse where that is wished and there is a smaller image. `None` without an image.
-    pub fn view(&self, coarse: bool, pace: f32, scored: Option<WrongPixels>) -> Option<TrainingView<'_>> {
+    pub fn view(
+        &self,
+        coarse: bool,
+        pace: f32,
+        (scored, skip): (Option<WrongPixels>, Option<TileSkip>),
+    ) -> Option<TrainingView<'_>> {
         let image = self.image.as_ref()?;
         Some(match image.half.as_ref().filter(|_| coarse) {
-            None => TrainingView { camera: self.camera, target: &image.whole, scored, pace },
+            None => TrainingView { camera: self.camera, target: &image.whole, scored, pace, skip },
             Some(target) => {
                 let pinhole = halved_pinhole(&self.camera.pinhole);
-                TrainingView { camera: ViewCamera { pinhole, ..self.camera }, target, scored, pace }
+                TrainingView { camera: ViewCamera { pinhole, ..self.camera }, target, scored, pace, skip }
             }
         })
     }

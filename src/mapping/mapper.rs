@@ -275,7 +275,9 @@ impl Mapper {
 
     fn steps(&mut self, batch: &[Step], scored: Option<WrongPixels>) -> Result<Vec<StepReport>, MappingError> {
         let view = |step: &Step| {
-            self.keyframes[step.keyframe].view(step.coarse, step.pace, scored).expect("only keyframes with images are drawn")
+            self.keyframes[step.keyframe]
+                .view(step.coarse, step.pace, (scored, self.config.skip.tiles()))
+                .expect("only keyframes with images are drawn")
         };
         let views: Vec<TrainingView<'_>> = batch.iter().map(view).collect();
         let started = Instant::now();

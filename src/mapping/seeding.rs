@@ -1,15 +1,16 @@
-//! New Gaussians from a keyframe: where the render lacks alpha or lies behind the measured surface, one per block of pixels, small
-//! blocks where the image has detail and larger ones where it is flat, each the size of its block on the surface.
+//! New Gaussians from a keyframe: where the render lacks alpha or lies behind the measured surface, one per block of pixels: a quadtree
+//! of blocks, small where the colours vary and large where they don't, each seed the size of its block on the surface.
 //!
 //! Pixels without depth are seeded too where the map has nothing: their depth is interpolated across the hole, from the farther side
 //! where the sides differ (a structured-light sensor is blind in the shadow beside a near object). Later views correct them.
 
 use glam::{Quat, Vec3};
+use image::RgbImage;
 use nalgebra::{Point3, Rotation3, UnitQuaternion, Vector2, Vector3};
 
 use super::{Keyframe, SeedingConfig};
 use crate::render::Rendered;
-use crate::sequence::{DepthImage, RectifiedImage};
+use crate::sequence::DepthImage;
 use crate::splat::{Gaussian, GaussianCloud, ShDegree, raw_opacity_from_opacity, sh::dc_from_color};
 
 /// Sides of a hole whose depths differ by more than this factor belong to different surfaces.
@@ -30,25 +31,17 @@ pub(super) fn seed(
     let Some(depth) = &image.depth else { return cloud };
     let filled = fill_holes(depth);
     let (width, height) = image.color.dimensions();
-    let coarse = config.flat_stride;
-    for y0 in (0..height).step_by(coarse as usize) {
-        for x0 in (0..width).step_by(coarse as usize) {
-            let detailed = mean_gradient(image, x0, y0, coarse) > config.detail_gradient;
-            let stride = if detailed { config.stride } else { coarse };
-            for y in (y0..(y0 + coarse).min(height)).step_by(stride as usize) {
-                for x in (x0..(x0 + coarse).min(width)).step_by(stride as usize) {
-                    let center = ((x + stride / 2).min(width - 1), (y + stride / 2).min(height - 1));
-                    let metres = filled[(center.1 * width + center.0) as usize];
-                    let measured = depth.at(center.0, center.1);
-                    if metres >= config.min_depth_metres
-                        && metres <= config.max_depth_metres
-                        && rendered.is_none_or(|r| lacks(r, (center.1 * width + center.0) as usize, measured, config))
-                    {
-                        let slope = slope(&filled, (width, height), center, stride);
-                        cloud.push(gaussian(keyframe, center, (metres, slope), stride, config));
-                    }
-                }
-            }
+    let sums = ColorSums::new(&image.color);
+    for block in sums.blocks(config) {
+        let center = ((block.x + block.size / 2).min(width - 1), (block.y + block.size / 2).min(height - 1));
+        let metres = filled[(center.1 * width + center.0) as usize];
+        let measured = depth.at(center.0, center.1);
+        if metres >= config.min_depth_metres
+            && metres <= config.max_depth_metres
+            && rendered.is_none_or(|r| lacks(r, (center.1 * width + center.0) as usize, measured, config))
+        {
+            let slope = slope(&filled, (width, height), center, block.size);
+            cloud.push(gaussian(keyframe, center, (metres, slope), block.size, config));
         }
     }
     cloud
@@ -112,16 +105,65 @@ fn gaussian(
     }
 }
 
-/// Mean absolute colour difference to the right and lower neighbours over a block, 0 to 1.
-fn mean_gradient(image: &RectifiedImage, x0: u32, y0: u32, size: u32) -> f32 {
-    let (width, height) = image.color.dimensions();
-    let at = |x: u32, y: u32| image.color.get_pixel(x.min(width - 1), y.min(height - 1)).0.map(i32::from);
-    let difference = |a: [i32; 3], b: [i32; 3]| (0..3).map(|c| (a[c] - b[c]).abs()).sum::<i32>();
-    let mut sum = 0;
-    for (x, y) in (y0..y0 + size).flat_map(|y| (x0..x0 + size).map(move |x| (x, y))) {
-        sum += difference(at(x, y), at(x + 1, y)) + difference(at(x, y), at(x, y + 1));
+/// A square of pixels that gets one seed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct Block {
+    x: u32,
+    y: u32,
+    size: u32,
+}
+
+/// Sums over the pixels above and left of each corner, `[H + 1, W + 1]`: the channels, and the squares of all three (8-bit values).
+struct ColorSums {
+    width: u32,
+    height: u32,
+    sums: Vec<[u64; 4]>,
+}
+
+impl ColorSums {
+    fn new(image: &RgbImage) -> Self {
+        let (width, height) = image.dimensions();
+        let row = width as usize + 1;
+        let mut sums = vec![[0; 4]; row * (height as usize + 1)];
+        for (x, y, pixel) in image.enumerate_pixels() {
+            let [r, g, b] = pixel.0.map(u64::from);
+            let own = [r, g, b, r * r + g * g + b * b];
+            let at = (y as usize + 1) * row + x as usize + 1;
+            sums[at] = std::array::from_fn(|k| own[k] + sums[at - 1][k] + sums[at - row][k] - sums[at - row - 1][k]);
+        }
+        Self { width, height, sums }
     }
-    sum as f32 / (255.0 * 6.0 * (size * size) as f32)
+
+    /// Blocks that cover the image: quartered while their colours deviate more than noise does, but not below the stride.
+    fn blocks(&self, config: &SeedingConfig) -> Vec<Block> {
+        let size = config.flat_stride;
+        let corners =
+            (0..self.height).step_by(size as usize).flat_map(|y| (0..self.width).step_by(size as usize).map(move |x| (x, y)));
+        let mut blocks = Vec::new();
+        let mut open: Vec<Block> = corners.map(|(x, y)| Block { x, y, size }).collect();
+        while let Some(block) = open.pop() {
+            if block.size >= 2 * config.stride && self.deviation(block) > config.detail {
+                let half = block.size / 2;
+                let quarters = [(0, 0), (half, 0), (0, half), (half, half)].map(|(dx, dy)| (block.x + dx, block.y + dy));
+                let inside = quarters.into_iter().filter(|(x, y)| *x < self.width && *y < self.height);
+                open.extend(inside.map(|(x, y)| Block { x, y, size: half }));
+            } else {
+                blocks.push(block);
+            }
+        }
+        blocks
+    }
+
+    /// Standard deviation of the colours about their mean over the part of a block that is on the image, 0 to 1, mean over the channels.
+    fn deviation(&self, block: Block) -> f32 {
+        let (x1, y1) = ((block.x + block.size).min(self.width), (block.y + block.size).min(self.height));
+        let at = |x: u32, y: u32| self.sums[y as usize * (self.width as usize + 1) + x as usize];
+        let (a, b, c, d) = (at(block.x, block.y), at(x1, block.y), at(block.x, y1), at(x1, y1));
+        let sum: [f64; 4] = std::array::from_fn(|k| (d[k] + a[k] - b[k] - c[k]) as f64);
+        let pixels = f64::from((x1 - block.x) * (y1 - block.y));
+        let variance = (sum[3] - (sum[0] * sum[0] + sum[1] * sum[1] + sum[2] * sum[2]) / pixels) / (3.0 * pixels);
+        variance.max(0.0).sqrt() as f32 / 255.0
+    }
 }
 
 /// Depth with its holes interpolated from their four sides, metres; 0 only where a pixel has no measured side at all.
@@ -165,7 +207,8 @@ fn interpolate(around: &[(f32, f32); 4]) -> f32 {
 mod tests {
     use super::*;
     use crate::geometry::{Pinhole, Se3};
-    use image::{Rgb, RgbImage};
+    use crate::sequence::RectifiedImage;
+    use image::Rgb;
 
     fn keyframe(color: RgbImage, metres: Vec<f32>) -> Keyframe {
         let (width, height) = color.dimensions();
@@ -176,13 +219,30 @@ mod tests {
 
     #[test]
     fn detail_gets_more_seeds_than_a_flat_wall() {
-        let config = SeedingConfig::default();
+        let config = SeedingConfig { stride: 2, flat_stride: 8, ..SeedingConfig::default() };
         let checker = RgbImage::from_fn(32, 24, |x, y| if x < 16 { Rgb([90; 3]) } else { Rgb([((x + y) % 2 * 255) as u8; 3]) });
         let cloud = seed(&keyframe(checker, vec![1.0; 32 * 24]), None, &config, ShDegree::default());
         let column = |m: &Vec3| m.x * 30.0 + 15.5;
-        // The last flat block borders on detail and counts as such.
-        assert_eq!(cloud.means.iter().filter(|m| column(m) < 11.5).count(), 3 * 6);
-        assert_eq!(cloud.means.iter().filter(|m| column(m) > 16.5).count(), 8 * 12);
+        assert_eq!(cloud.means.iter().filter(|m| column(m) < 15.9).count(), 2 * 3);
+        assert_eq!(cloud.means.iter().filter(|m| column(m) > 16.1).count(), 8 * 12);
+    }
+
+    #[test]
+    fn blocks_cover_each_pixel_once_and_shrink_towards_an_edge() {
+        let config = SeedingConfig { stride: 1, flat_stride: 8, ..SeedingConfig::default() };
+        let edge = RgbImage::from_fn(45, 27, |x, y| if x < 19 { Rgb([40; 3]) } else { Rgb([200 + (y % 2) as u8; 3]) });
+        let blocks = ColorSums::new(&edge).blocks(&config);
+        let mut covered = vec![0; 45 * 27];
+        for block in &blocks {
+            for (x, y) in (block.y..block.y + block.size).flat_map(|y| (block.x..block.x + block.size).map(move |x| (x, y))) {
+                if x < 45 && y < 27 {
+                    covered[(y * 45 + x) as usize] += 1;
+                }
+            }
+        }
+        assert!(covered.iter().all(|&times| times == 1));
+        let largest_at = |column: u32| blocks.iter().filter(|b| (b.x..b.x + b.size).contains(&column)).map(|b| b.size).max();
+        assert_eq!([largest_at(18), largest_at(19), largest_at(30)], [Some(1), Some(1), Some(8)]);
     }
 
     #[test]

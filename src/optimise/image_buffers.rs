@@ -2,6 +2,7 @@
 
 use super::TargetImage;
 use crate::gpu::{Gpu, GpuBuffer, GpuError};
+use crate::render::layout::{TILE_HEIGHT, TILE_WIDTH};
 
 /// Pixels along a side of what one workgroup of the loss shaders covers.
 pub(super) const LOSS_TILE: u32 = 16;
@@ -10,6 +11,11 @@ const LOSS_RADIUS: u32 = 5;
 /// Twin of the shaders' function: pixels along a side of a plane with a border of zeros.
 fn bordered(size: u32) -> u32 {
     size.next_multiple_of(LOSS_TILE) + 2 * LOSS_RADIUS
+}
+
+/// Tiles of an image, for which the loss is summed.
+pub(super) fn tiles((width, height): (u32, u32)) -> usize {
+    (width.div_ceil(TILE_WIDTH) * height.div_ceil(TILE_HEIGHT)) as usize
 }
 
 /// Sizes of view that the optimiser keeps buffers for: whole and half.
@@ -23,19 +29,18 @@ pub(super) struct ImageBuffers {
     pub target: TargetImage,
     pub partials: GpuBuffer,
     pub gradients: GpuBuffer,
-    /// Its length is the number of terms that are summed.
+    /// [tiles] of the step's view, those of tiles left out from earlier steps; its length is the number of terms that are summed.
     pub loss_sums: GpuBuffer,
 }
 
 impl ImageBuffers {
     fn new(gpu: &Gpu, (width, height): (u32, u32)) -> Result<Self, GpuError> {
-        let blocks = u64::from(width.div_ceil(LOSS_TILE) * height.div_ceil(LOSS_TILE / 2));
         Ok(Self {
             size: (width, height),
             target: TargetImage::blank(gpu, (width, height))?,
             partials: GpuBuffer::storage(gpu, "loss partials", u64::from(bordered(width)) * u64::from(bordered(height)) * 48)?,
             gradients: GpuBuffer::storage(gpu, "image gradients", u64::from(width * height) * 32)?,
-            loss_sums: GpuBuffer::storage(gpu, "loss sums", blocks * 16)?,
+            loss_sums: GpuBuffer::storage(gpu, "loss sums", tiles((width, height)) as u64 * 16)?,
         })
     }
 }

@@ -3,6 +3,7 @@
 use image::RgbImage;
 use serde::{Deserialize, Serialize};
 
+use super::image_buffers;
 use crate::gpu::{Gpu, GpuBuffer, GpuError};
 
 /// Weights of the image loss `(1-λ)·L1 + λ·(1-SSIM) + λ_depth·L1(depth)`.
@@ -75,6 +76,8 @@ pub struct TargetImage {
     pub height: u32,
     pub(super) color: GpuBuffer,
     pub(super) depth: GpuBuffer,
+    /// [tiles] sums of the loss terms when each tile was last worked on, see `loss_forward.wgsl`.
+    pub(super) tile_losses: GpuBuffer,
 }
 
 impl TargetImage {
@@ -94,7 +97,10 @@ impl TargetImage {
     pub(super) fn blank(gpu: &Gpu, (width, height): (u32, u32)) -> Result<Self, GpuError> {
         let bytes = u64::from(width) * u64::from(height) * 4;
         let plane = |label: &str| GpuBuffer::storage(gpu, label, bytes);
-        Ok(Self { width, height, color: plane("target colour")?, depth: plane("target depth")? })
+        let unknown = vec![[-1.0f32, 0.0, 0.0, 0.0]; image_buffers::tiles((width, height))];
+        let tile_losses = GpuBuffer::storage(gpu, "tile losses", unknown.len() as u64 * 16)?;
+        tile_losses.write(gpu, 0, &unknown);
+        Ok(Self { width, height, color: plane("target colour")?, depth: plane("target depth")?, tile_losses })
     }
 
     /// Becomes a copy of an image of the same size.

@@ -9,5 +9,5 @@ mod scores;
 
 pub use adam::AdamConfig;
 pub use loss::{LossConfig, LossTerms, TargetImage};
-pub use optimiser::{Gradients, Optimiser, StepReport, TrainingView};
+pub use optimiser::{Gradients, Optimiser, StepReport, TileSkip, TrainingView};
 pub use scores::{GaussianScore, WrongPixels};

@@ -3,13 +3,14 @@
 use std::time::{Duration, Instant};
 
 use bytemuck::{Pod, Zeroable};
+use serde::Serialize;
 
 use super::image_buffers::{self, ImageBuffers, LOSS_TILE};
 use super::kernels::Kernels;
 use super::scores::{GaussianScore, Scores, WrongPixels};
 use super::{AdamConfig, LossConfig, LossTerms, TargetImage};
 use crate::gpu::{Gpu, GpuBuffer, GpuError, workgroups};
-use crate::render::layout::{AdamSetup, COUNTERS, Counter, LossSetup, VISIBLE_COUNTER, View};
+use crate::render::layout::{AdamSetup, COUNTERS, Counter, LossSetup, TileSkipSetup, VISIBLE_COUNTER, View};
 use crate::render::{GpuCloud, PreparedView, Rasterizer, ViewCounts, cloud_from_planes};
 use crate::splat::{GaussianCloud, ViewCamera};
 
@@ -31,6 +32,20 @@ pub struct TrainingView<'a> {
     pub scored: Option<WrongPixels>,
     /// Share of Adam's step sizes that the step takes.
     pub pace: f32,
+    /// Which tiles are left out; a scored step leaves none.
+    pub skip: Option<TileSkip>,
+}
+
+/// Which tiles of a view a step leaves out, by their loss when each was last worked on; unknown ones never. The reported loss is
+/// that of the whole view all the same, as far as it is known.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct TileSkip {
+    /// A tile whose loss is the view's mean is worked on in this share of the steps, one of more loss in proportion more often,
+    pub share: f32,
+    /// each in this share at least,
+    pub least: f32,
+    /// and one of less loss than this per pixel no more often.
+    pub noise: f32,
 }
 
 /// What a step leaves behind on the GPU: sums of the loss, the gradient by the pose, and the counters.
@@ -54,8 +69,8 @@ pub struct Gradients {
 
 /// Where the backward pass starts from.
 enum Objective<'a> {
-    /// With the Gaussians' scores on the way, if asked for.
-    Image(&'a TargetImage, &'a LossConfig, Option<&'a WrongPixels>),
+    /// With the Gaussians' scores on the way, if asked for, and the tiles to leave out with the seed of the draw.
+    Image { target: &'a TargetImage, loss: &'a LossConfig, scored: Option<&'a WrongPixels>, skip: Option<(TileSkip, u32)> },
     /// Gradients by the image are in the buffer already.
     Given,
 }
@@ -76,6 +91,7 @@ pub struct Optimiser {
     encode_time: Duration,
     adam: GpuBuffer,
     loss_setup: GpuBuffer,
+    skip_setup: GpuBuffer,
     /// Of each size of view, the present one first.
     images: Vec<ImageBuffers>,
     gaussians: usize,
@@ -101,6 +117,7 @@ impl Optimiser {
             encode_time: Duration::ZERO,
             adam: GpuBuffer::uniform(gpu, "Adam", &AdamSetup::zeroed())?,
             loss_setup: GpuBuffer::uniform(gpu, "loss setup", &LossSetup::zeroed())?,
+            skip_setup: GpuBuffer::uniform(gpu, "tile skip", &TileSkipSetup::zeroed())?,
             images: Vec::new(),
             gaussians: 0,
             loss_total: GpuBuffer::computed_uniform(gpu, "loss", 16)?,
@@ -125,8 +142,9 @@ impl Optimiser {
         let mut pending: Vec<usize> = (0..views.len()).collect();
         while !pending.is_empty() {
             for (entry, &i) in pending.iter().enumerate() {
-                let TrainingView { camera, target, scored, pace } = &views[i];
-                let objective = Objective::Image(target, loss, scored.as_ref());
+                let TrainingView { camera, target, scored, pace, skip } = &views[i];
+                let skip = skip.filter(|_| scored.is_none()).map(|skip| (skip, self.steps as u32));
+                let objective = Objective::Image { target, loss, scored: scored.as_ref(), skip };
                 let started = Instant::now();
                 self.adam.write(&gpu, 0, &[adam.setup(self.steps, *pace)]);
                 self.steps += 1;
@@ -192,7 +210,8 @@ impl Optimiser {
         loss: &LossConfig,
     ) -> Result<Gradients, GpuError> {
         let gpu = rasterizer.gpu().clone();
-        let mut gradients = self.collect(rasterizer, cloud, camera, [0.0; 3], &Objective::Image(target, loss, None))?;
+        let mut gradients =
+            self.collect(rasterizer, cloud, camera, [0.0; 3], &Objective::Image { target, loss, scored: None, skip: None })?;
         gradients.loss = self.read_loss(&gpu, target)?;
         Ok(gradients)
     }
@@ -267,35 +286,63 @@ impl Optimiser {
         let prepared = rasterizer.prepare(cloud, camera, background)?;
         self.reserve(&gpu, &prepared.view, cloud)?;
         rasterizer.encode_clear(encoder);
-        if let Objective::Image(target, ..) = objective {
+        if let Objective::Image { target, .. } = objective {
             self.images[0].target.encode_copy(encoder, target);
+            copy(encoder, &target.tile_losses, &self.images[0].loss_sums);
         }
         if let Sink::Gradient(buffer) = sink {
             encoder.clear_buffer(buffer.raw(), 0, None);
         }
         let mut pass = encoder.begin_compute_pass(&Default::default());
+        if let Objective::Image { loss, skip: Some(skip), .. } = objective {
+            self.encode_select(&mut pass, rasterizer, loss, skip);
+        }
         rasterizer.encode_forward(&mut pass, cloud, &prepared);
-        if let Objective::Image(_, loss, scored) = objective {
-            self.encode_loss(&mut pass, rasterizer, loss);
+        if let Objective::Image { loss, scored, skip, .. } = objective {
+            self.encode_loss(&mut pass, rasterizer, loss, skip.is_some());
             let image = (&self.images[0].gradients, &self.loss_total);
             scored.iter().for_each(|wrong| self.scores.encode(&mut pass, rasterizer, &prepared, image, (wrong, loss)));
         }
         self.encode_backward(&mut pass, rasterizer, cloud, &prepared, sink);
         gpu.mark(&mut pass, Self::END_MARK);
+        drop(pass);
+        if let Objective::Image { target, .. } = objective {
+            copy(encoder, &self.images[0].loss_sums, &target.tile_losses);
+        }
         Ok(())
     }
 
-    fn encode_loss(&self, pass: &mut wgpu::ComputePass<'_>, rasterizer: &Rasterizer, loss: &LossConfig) {
+    /// Chooses the tiles to leave out.
+    fn encode_select(
+        &self,
+        pass: &mut wgpu::ComputePass<'_>,
+        rasterizer: &Rasterizer,
+        loss: &LossConfig,
+        (skip, seed): &(TileSkip, u32),
+    ) {
+        let (gpu, ws) = (rasterizer.gpu(), &rasterizer.workspace);
+        let TileSkip { share, least, noise } = *skip;
+        let LossConfig { ssim_weight, depth_weight } = *loss;
+        self.skip_setup.write(gpu, 0, &[TileSkipSetup { share, least, noise, ssim_weight, depth_weight, seed: *seed }]);
+        let select = [(0, rasterizer.view()), (1, &self.skip_setup), (2, &self.images[0].loss_sums), (3, &ws.skipped)];
+        self.kernels.select_tiles.dispatch(gpu, pass, &select, [1, 1, 1]);
+    }
+
+    fn encode_loss(&self, pass: &mut wgpu::ComputePass<'_>, rasterizer: &Rasterizer, loss: &LossConfig, skips: bool) {
         let (gpu, ws, k) = (rasterizer.gpu(), &rasterizer.workspace, &self.kernels);
-        let TargetImage { width, height, color, depth } = &self.images[0].target;
+        let TargetImage { width, height, color, depth, .. } = &self.images[0].target;
         let (width, height) = (*width, *height);
+        if skips {
+            let fill = [(0, rasterizer.view()), (1, &ws.skipped), (2, color), (3, &ws.color_depth)];
+            k.fill_skipped.dispatch(gpu, pass, &fill, workgroups(image_buffers::tiles((width, height)) as u32));
+        }
         let setup = LossSetup { width, height, ssim_weight: loss.ssim_weight, depth_weight: loss.depth_weight };
         self.loss_setup.write(gpu, 0, &[setup]);
         let forward = [width.div_ceil(LOSS_TILE), height.div_ceil(LOSS_TILE / 2), 1];
         let backward = [width.div_ceil(LOSS_TILE), height.div_ceil(LOSS_TILE), 1];
         let inputs =
             [(0, &self.loss_setup), (1, &ws.color_depth), (2, &ws.state), (3, color), (4, depth), (5, &self.images[0].partials)];
-        let with = |last| inputs.iter().copied().chain([last]).collect::<Vec<_>>();
+        let with = |last| inputs.iter().copied().chain([last, (7, &ws.skipped)]).collect::<Vec<_>>();
         k.loss_forward.dispatch(gpu, pass, &with((6, &self.images[0].loss_sums)), forward);
         k.loss_reduce.dispatch(gpu, pass, &[(0, &self.images[0].loss_sums), (1, &self.loss_total)], [1, 1, 1]);
         k.loss_backward.dispatch(gpu, pass, &with((6, &self.images[0].gradients)), backward);
@@ -360,6 +407,10 @@ impl Optimiser {
         }
         Ok(())
     }
+}
+
+fn copy(encoder: &mut wgpu::CommandEncoder, from: &GpuBuffer, to: &GpuBuffer) {
+    encoder.copy_buffer_to_buffer(from.raw(), 0, to.raw(), 0, from.raw().size());
 }
 
 /// (ρ, θ) of a vector as the GPU keeps it: (ρ, 0), (θ, 0).

@@ -77,7 +77,7 @@ pub fn realtime_scale(gpu: &Arc<Gpu>, sequence: &Sequence, config: &Config) -> R
         chosen = scale;
         let size = (pinhole.width, pinhole.height);
         let scene = BenchScene::new(gpu, (size.0 * size.1 / PIXELS_EACH) as usize, size, config.mapping.sh_degree)?;
-        let wall = StepRunner::new(gpu, scene, BlendForm::of(gpu))?.run()?.wall;
+        let wall = StepRunner::new(gpu, scene, BlendForm::of(gpu), None)?.run()?.wall;
         tracing::info!(scale, step_ms = wall.as_secs_f64() * 1e3, "measured a training step");
         if wall <= STEP {
             break;

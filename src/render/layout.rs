@@ -188,6 +188,15 @@ host_twins! {
         emit: u32,
         pad: [u32; 3],
     }
+    /// Which tiles a step leaves out (`shaders/select_tiles.wgsl`).
+    TileSkipSetup {
+        share: f32,
+        least: f32,
+        noise: f32,
+        ssim_weight: f32,
+        depth_weight: f32,
+        seed: u32,
+    }
     GatherSetup {
         count: u32,
         planes: u32,

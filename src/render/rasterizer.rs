@@ -149,6 +149,7 @@ impl Rasterizer {
     /// Encodes what must precede the pass of [`Self::encode_forward`].
     pub fn encode_clear(&self, encoder: &mut wgpu::CommandEncoder) {
         encoder.clear_buffer(self.workspace.ranges.raw(), 0, None);
+        encoder.clear_buffer(self.workspace.skipped.raw(), 0, None);
         encoder.clear_buffer(self.workspace.counters.raw(), 0, None);
     }
 
@@ -158,7 +159,7 @@ impl Rasterizer {
         let (view, uniform) = (&prepared.view, &self.view);
         let count = view.gaussian_count;
         let per_gaussian = workgroups(count.div_ceil(256));
-        let project = [(0, uniform), (1, cloud.parameters()), (2, &ws.projected), (3, &ws.visible)];
+        let project = [(0, uniform), (1, cloud.parameters()), (2, &ws.projected), (3, &ws.visible), (4, &ws.skipped)];
         k.project_forward.dispatch(gpu, pass, &project, per_gaussian);
         let job = ScanJob { setup: &self.visible_scan, values: &ws.visible, prefix: &ws.prefix, bound: count };
         k.scan.encode(gpu, pass, ws, &job);
@@ -195,6 +196,7 @@ impl Rasterizer {
                 (7, &ws.tile_keys[0]),
                 (8, &ws.slots[0]),
                 (9, &ws.slot_gaussians),
+                (10, &ws.skipped),
             ]
         };
         k.tile_lists.dispatch_indirect(gpu, pass, &lists(&self.count_mode), visible);

@@ -5,6 +5,8 @@ use crate::gpu::{Gpu, GpuBuffer, GpuError};
 
 /// Bytes of one pair's gradient: three vec4.
 const PAIR_GRADIENT_BYTES: u64 = 48;
+/// Bytes of the mask of tiles that a step leaves out, one bit a tile: what a uniform may hold anywhere.
+const SKIPPED_TILES: u64 = 16_384;
 
 /// Scratch that one rendered view leaves behind for its backward pass. Sizes only grow.
 #[derive(Debug)]
@@ -32,6 +34,8 @@ pub struct Workspace {
     pixels: u32,
     tiles: u32,
     pub ranges: GpuBuffer,
+    /// One bit a tile.
+    pub skipped: GpuBuffer,
     pub color_depth: GpuBuffer,
     pub state: GpuBuffer,
 }
@@ -60,6 +64,7 @@ impl Workspace {
             pixels: 0,
             tiles: 0,
             ranges: empty("ranges")?,
+            skipped: GpuBuffer::computed_uniform(gpu, "skipped tiles", SKIPPED_TILES)?,
             color_depth: empty("rendered")?,
             state: empty("rendered state")?,
         };

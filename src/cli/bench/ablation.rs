@@ -64,15 +64,18 @@ impl Row {
 pub(super) fn ablation(args: &AblationArgs) -> miette::Result<()> {
     let mut base = args.run.resolve()?;
     let sequence = run::open(&mut base)?;
+    let given = Variant { name: "as given".into(), settings: Vec::new() };
+    let variants = if args.variants.is_empty() { std::slice::from_ref(&given) } else { &args.variants };
+    // A wrong setting is told before anything is done.
+    let configs: Vec<Config> =
+        variants.iter().map(|v| base.with_settings(&v.settings)).collect::<Result<_, _>>().into_diagnostic()?;
+    std::fs::create_dir_all(&args.run.out).into_diagnostic()?;
     let gpu = Gpu::open(base.adapter.as_deref()).into_diagnostic()?;
     let recording = pipeline::record(&sequence, &base, &Progress::default()).into_diagnostic()?;
     println!("| variant | steps/keyframe | mapping s | steps | Gaussians | held-out PSNR dB | SSIM | depth L1 cm |");
     println!("|---|---|---|---|---|---|---|---|");
     let mut rows = Vec::new();
-    let given = Variant { name: "as given".into(), settings: Vec::new() };
-    let variants = if args.variants.is_empty() { std::slice::from_ref(&given) } else { &args.variants };
-    for variant in variants {
-        let config = base.with_settings(&variant.settings).into_diagnostic()?;
+    for (variant, config) in variants.iter().zip(configs) {
         let own = [config.mapping.iterations_per_keyframe];
         for &iterations in if args.iterations.is_empty() { &own } else { args.iterations.as_slice() } {
             let mut config = config.clone();
@@ -84,19 +87,21 @@ pub(super) fn ablation(args: &AblationArgs) -> miette::Result<()> {
                 Ok(())
             };
             let every = args.rows_every.unwrap_or(usize::MAX).max(1);
-            let (mut next, mut failed) = (every, Ok(()));
+            let (mut next, mut last, mut failed) = (every, 0, Ok(()));
             let mut on_round = |mapped: Mapped| {
                 if mapped.steps >= next && failed.is_ok() {
                     next = (mapped.steps / every + 1).saturating_mul(every);
+                    last = mapped.steps;
                     failed = row(&mapped);
                 }
             };
             let mapped = recording.map(&gpu, &config.mapping, &Progress::default(), &mut on_round).into_diagnostic()?;
             failed?;
-            row(&mapped)?;
+            if mapped.steps != last {
+                row(&mapped)?;
+            }
         }
     }
-    std::fs::create_dir_all(&args.run.out).into_diagnostic()?;
     let text = serde_json::to_string_pretty(&rows).into_diagnostic()?;
     keysplat::export::write_atomically(&args.run.out.join("ablation.json"), text.as_bytes()).into_diagnostic()?;
     Ok(())
