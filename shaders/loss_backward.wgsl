@@ -63,7 +63,7 @@ fn main(
         let measured = target_depth[index];
         if setup.depth_weight > 0.0 && measured > 0.0 {
             let residual = rendered[k].w - (1.0 - state[index].x) * measured;
-            gradient[k].w = sign(residual) * setup.depth_weight * per_pixel;
+            gradient[k].w = sign(residual) * setup.depth_weight * depth_precision(measured) * per_pixel;
             gradient_alpha = -gradient[k].w * measured;
         }
         image_gradients[index] = gradient[k];

@@ -1,5 +1,5 @@
 // Photometric and depth loss of a rendered view, and what the backward pass needs of SSIM: its partial derivatives by the local mean,
-// mean square and mean product. L = (1-λ)·L1 + λ·(1-SSIM) + λ_depth·|Σ w z - (1-T)·sensor depth|, means over the image.
+// mean square and mean product. L = (1-λ)·L1 + λ·(1-SSIM) + λ_depth·p·|Σ w z - (1-T)·sensor depth|, p the sensor's precision there, means over the image.
 
 @group(0) @binding(0) var<uniform> setup: LossSetup;
 // [H, W] rendered (r, g, b, Σ w z); (transmittance, -).
@@ -75,7 +75,7 @@ fn main(
         sum.x += abs(error.x) + abs(error.y) + abs(error.z);
         sum.w += dot(error, error);
         if setup.depth_weight > 0.0 && measured > 0.0 {
-            sum.z += abs(rendered.w - (1.0 - state[index].x) * measured);
+            sum.z += depth_precision(measured) * abs(rendered.w - (1.0 - state[index].x) * measured);
         }
     }
     sums[local] = sum;

@@ -130,7 +130,7 @@ fn upload_target(gpu: &Gpu, image: &RgbImage, wide: &Target64) -> TargetImage {
 #[test]
 fn the_loss_and_its_whole_gradient_agree() {
     let Some(gpu) = gpu() else { return };
-    let config = LossConfig { ssim_weight: 0.2, depth_weight: 0.3 };
+    let config = LossConfig { ssim_weight: 0.2, depth_weight: 0.3, precise_depth_metres: 1.5 };
     for seed in 0..4 {
         let mut rng = Rng::with_seed(40 + seed);
         // Neither a multiple of the tile nor of the loss's block.
@@ -144,7 +144,11 @@ fn the_loss_and_its_whole_gradient_agree() {
         let got = optimiser.gradients(&mut rasterizer, &on_gpu, &camera, &image, &config).unwrap();
         let view = View64 { background: Vector3::zeros(), ..view64(&camera) };
         let rendered = rasterize_forward::render(&view, &cloud64(&cloud));
-        let weights = LossWeights { ssim: f64::from(config.ssim_weight), depth: f64::from(config.depth_weight) };
+        let weights = LossWeights {
+            ssim: f64::from(config.ssim_weight),
+            depth: f64::from(config.depth_weight),
+            precise_depth: f64::from(config.precise_depth_metres),
+        };
         let (value, by_image) = loss(&rendered, &wide, &weights);
         let difference = (f64::from(got.loss.total(&config)) - value).abs();
         assert!(difference < 1e-4 * value, "loss {} against {value}", got.loss.total(&config));

@@ -10,7 +10,7 @@ use keysplat::optimise::{AdamConfig, LossConfig, Optimiser, StepReport, TargetIm
 use keysplat::render::{BlendForm, GpuCloud, Rasterizer};
 use keysplat::splat::{GaussianCloud, ShDegree};
 
-const LOSS: LossConfig = LossConfig { ssim_weight: 0.2, depth_weight: 0.0 };
+const LOSS: LossConfig = LossConfig { ssim_weight: 0.2, depth_weight: 0.0, precise_depth_metres: 2.0 };
 /// Tiles below the noise never, all others always.
 const NOISE_ONLY: TileSkip = TileSkip { share: 1e6, least: 0.0, noise: 0.02 };
 const WIDTH: u32 = 128;

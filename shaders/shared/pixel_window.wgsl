@@ -79,4 +79,12 @@ struct LossSetup {
     ssim_weight: f32,
     // λ_depth per metre; 0 without depth.
     depth_weight: f32,
+    // Depth, metres, beyond which the weight falls with its square, as a sensor's precision does.
+    precise_depth: f32,
+}
+
+// What a measured depth's residual counts, as a share of `depth_weight`.
+fn depth_precision(measured: f32) -> f32 {
+    let ratio = setup.precise_depth / measured;
+    return min(1.0, ratio * ratio);
 }

@@ -144,7 +144,7 @@ impl Default for SeedingConfig {
             thickness: 1.0,
             opacity: 0.7,
             min_depth_metres: 0.15,
-            max_depth_metres: 20.0,
+            max_depth_metres: 200.0,
         }
     }
 }
@@ -213,8 +213,12 @@ impl MappingConfig {
     /// The same for a world whose unit is not the metre but `units_per_metre` to one: each length is given in that unit.
     pub fn in_units(&self, units_per_metre: f32) -> Self {
         let mut scaled = self.clone();
-        let lengths =
-            [&mut scaled.density.max_scale_metres, &mut scaled.seeding.min_depth_metres, &mut scaled.seeding.max_depth_metres];
+        let lengths = [
+            &mut scaled.density.max_scale_metres,
+            &mut scaled.seeding.min_depth_metres,
+            &mut scaled.seeding.max_depth_metres,
+            &mut scaled.loss.precise_depth_metres,
+        ];
         lengths.into_iter().for_each(|length| *length *= units_per_metre);
         scaled.loss.depth_weight /= units_per_metre;
         scaled

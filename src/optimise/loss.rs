@@ -14,11 +14,13 @@ pub struct LossConfig {
     pub ssim_weight: f32,
     /// λ_depth, per metre of depth error.
     pub depth_weight: f32,
+    /// Depth beyond which λ_depth falls with the depth's square, as the precision of structured light and stereo does, metres.
+    pub precise_depth_metres: f32,
 }
 
 impl Default for LossConfig {
     fn default() -> Self {
-        Self { ssim_weight: 0.2, depth_weight: 0.1 }
+        Self { ssim_weight: 0.2, depth_weight: 0.1, precise_depth_metres: 4.0 }
     }
 }
 
@@ -28,11 +30,10 @@ impl LossConfig {
         if !(0.0..=1.0).contains(&self.ssim_weight) {
             return Err("ssim_weight must lie between 0 and 1".into());
         }
-        if self.depth_weight.is_finite() && self.depth_weight >= 0.0 {
-            Ok(())
-        } else {
-            Err("depth_weight must be finite and not negative".into())
+        if !(self.depth_weight.is_finite() && self.depth_weight >= 0.0) {
+            return Err("depth_weight must be finite and not negative".into());
         }
+        if self.precise_depth_metres > 0.0 { Ok(()) } else { Err("precise_depth_metres must be positive".into()) }
     }
 }
 
@@ -42,7 +43,7 @@ pub struct LossTerms {
     /// Mean |colour error| and mean SSIM over pixels and channels.
     pub l1: f32,
     pub ssim: f32,
-    /// Mean |Σ w z - α·sensor depth| over all pixels, metres.
+    /// Mean |Σ w z - α·sensor depth| over all pixels, each weighted by the sensor's precision, metres.
     pub depth_metres: f32,
     /// Mean squared colour error.
     pub mse: f32,

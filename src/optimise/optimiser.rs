@@ -322,7 +322,7 @@ impl Optimiser {
     ) {
         let (gpu, ws) = (rasterizer.gpu(), &rasterizer.workspace);
         let TileSkip { share, least, noise } = *skip;
-        let LossConfig { ssim_weight, depth_weight } = *loss;
+        let LossConfig { ssim_weight, depth_weight, .. } = *loss;
         self.skip_setup.write(gpu, 0, &[TileSkipSetup { share, least, noise, ssim_weight, depth_weight, seed: *seed }]);
         let select = [(0, rasterizer.view()), (1, &self.skip_setup), (2, &self.images[0].loss_sums), (3, &ws.skipped)];
         self.kernels.select_tiles.dispatch(gpu, pass, &select, [1, 1, 1]);
@@ -336,7 +336,8 @@ impl Optimiser {
             let fill = [(0, rasterizer.view()), (1, &ws.skipped), (2, color), (3, &ws.color_depth)];
             k.fill_skipped.dispatch(gpu, pass, &fill, workgroups(image_buffers::tiles((width, height)) as u32));
         }
-        let setup = LossSetup { width, height, ssim_weight: loss.ssim_weight, depth_weight: loss.depth_weight };
+        let LossConfig { ssim_weight, depth_weight, precise_depth_metres: precise_depth } = *loss;
+        let setup = LossSetup { width, height, ssim_weight, depth_weight, precise_depth };
         self.loss_setup.write(gpu, 0, &[setup]);
         let forward = [width.div_ceil(LOSS_TILE), height.div_ceil(LOSS_TILE / 2), 1];
         let backward = [width.div_ceil(LOSS_TILE), height.div_ceil(LOSS_TILE), 1];

@@ -20,6 +20,8 @@ pub struct Target64 {
 pub struct LossWeights {
     pub ssim: f64,
     pub depth: f64,
+    /// Depth beyond which its weight falls with the square, metres.
+    pub precise_depth: f64,
 }
 
 const C1: f64 = 0.01 * 0.01;
@@ -72,8 +74,9 @@ pub fn loss(image: &Image64, target: &Target64, weights: &LossWeights) -> (f64, 
     }
     for i in (0..pixels).filter(|&i| target.depth[i] > 0.0) {
         let residual = image.depth[i] - (1.0 - image.transmittance[i]) * target.depth[i];
-        value += weights.depth * residual.abs() * per_pixel;
-        let side = if residual == 0.0 { 0.0 } else { residual.signum() } * weights.depth * per_pixel;
+        let weight = weights.depth * (weights.precise_depth / target.depth[i]).powi(2).min(1.0) * per_pixel;
+        value += weight * residual.abs();
+        let side = if residual == 0.0 { 0.0 } else { residual.signum() } * weight;
         gradient.depth[i] = side;
         gradient.alpha[i] = -side * target.depth[i];
     }

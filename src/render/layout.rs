@@ -208,6 +208,7 @@ host_twins! {
         height: u32,
         ssim_weight: f32,
         depth_weight: f32,
+        precise_depth: f32,
     }
     /// What counts as a wrong pixel (`shaders/rasterize_scores.wgsl`).
     ScoreSetup {

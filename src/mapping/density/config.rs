@@ -71,7 +71,7 @@ impl Default for DensityConfig {
             strategy: DensityStrategy::default(),
             views: 4,
             min_opacity: 0.03,
-            max_scale_metres: 1.0,
+            max_scale_metres: 20.0,
             vcd: VcdConfig::default(),
             classic: ClassicConfig::default(),
         }

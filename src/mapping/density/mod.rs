@@ -168,7 +168,7 @@ mod tests {
         let new = Candidate { entry: Entry::default(), ..hidden };
         let nan = Candidate { mean: Vec3::NAN, ..good() };
         let faint = Candidate { raw_opacity: raw_opacity_from_opacity(0.01), ..good() };
-        let huge = Candidate { log_scale: Vec3::splat(2.0), ..good() };
+        let huge = Candidate { log_scale: Vec3::splat(4.0), ..good() };
         let all = [good(), hidden, new, nan, faint, huge];
         assert_eq!(plan(&all, 100, &config).keep, [0, 2]);
         // Without control of density only what went bad goes.
