@@ -12,6 +12,7 @@ pub mod optimise;
 pub mod pipeline;
 pub mod reference;
 pub mod render;
+pub mod report;
 pub mod sequence;
 pub mod splat;
 pub mod tracking;

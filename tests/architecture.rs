@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 const EVERYTHING_ABOVE: &[&str] = &["*"];
 
 /// A module, and the modules whose items it may name. `reference` is in nobody's list: only tests compare with it.
-const ALLOWED: [(&str, &[&str]); 16] = [
+const ALLOWED: [(&str, &[&str]); 17] = [
     ("geometry", &[]),
     ("sequence", &["geometry"]),
     ("splat", &["geometry"]),
@@ -25,6 +25,7 @@ const ALLOWED: [(&str, &[&str]); 16] = [
     ("view", &["geometry", "splat", "gpu", "render"]),
     ("config", EVERYTHING_ABOVE),
     ("pipeline", EVERYTHING_ABOVE),
+    ("report", EVERYTHING_ABOVE),
     ("cli", EVERYTHING_ABOVE),
 ];
 

@@ -68,7 +68,9 @@ fn a_run_writes_everything() {
         return;
     }
     let out = finished_run();
-    let files = ["config.toml", "keyframes.txt", "map.ply", "metrics.json", "trajectory.svg", "trajectory.txt", "views"];
+    let files = "comparison.json config.toml history.json keyframes.txt map.ply metrics.json trajectory.svg trajectory.txt views"
+        .split(' ')
+        .collect::<Vec<_>>();
     assert_eq!(names(out), set(&files));
     // Every 8th frame is held out; recorded and rendered stand side by side.
     assert_eq!(names(&out.join("views")), set(&["000007.png", "000015.png", "000023.png"]));

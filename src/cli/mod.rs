@@ -6,6 +6,7 @@ mod demo;
 mod eval;
 mod generate;
 mod progress;
+mod report;
 mod run;
 
 use std::io::{ErrorKind, IsTerminal, Write};
@@ -47,6 +48,8 @@ enum Command {
     Generate(generate::GenerateArgs),
     /// Measure a finished run, of ours or anybody's.
     Eval(eval::EvalArgs),
+    /// Draw a finished run as one HTML file that needs nothing else.
+    Report(report::ReportArgs),
     /// Measure speed.
     Bench(bench::BenchArgs),
     /// List the adapters that the mapper could use.
@@ -88,6 +91,7 @@ fn execute(command: Command, verbosity: Verbosity) -> miette::Result<()> {
         Command::Demo(args) => demo::demo(&args, verbosity),
         Command::Generate(args) => generate::generate(&args, verbosity),
         Command::Eval(args) => eval::eval(&args, verbosity),
+        Command::Report(args) => report::report(&args, verbosity),
         Command::Bench(args) => bench::bench(&args),
         Command::Adapters => adapters::adapters(),
     }

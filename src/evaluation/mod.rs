@@ -2,6 +2,7 @@
 //!
 //! Knows nothing of how poses and pictures were made; rendering them is the caller's business.
 
+mod comparison;
 mod drawing;
 pub mod image;
 pub mod machine;
@@ -9,6 +10,7 @@ pub mod metrics;
 pub mod trajectory;
 pub mod views;
 
+pub use comparison::{Comparison, PoseRecord};
 pub use drawing::draw_trajectory;
 pub use image::{ImageError, ImageF32, depth_l1, psnr, psnr_where_lit, ssim};
 pub use metrics::{Metrics, Times, sha256_hex, write_json};

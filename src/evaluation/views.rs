@@ -7,6 +7,7 @@ use std::sync::Arc;
 
 use image::{Rgb, RgbImage};
 use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
 
 use super::image::{ImageF32, depth_l1, psnr, psnr_where_lit, ssim};
 use super::metrics::{ImageMeans, ImageProtocols};
@@ -33,9 +34,21 @@ pub struct ViewSelection<'a> {
 
 /// One held-out view beside what was recorded.
 pub struct ComparedView {
-    pub frame: usize,
+    pub figures: ViewRecord,
     pub recorded: RgbImage,
     pub rendered: RgbImage,
+}
+
+/// How well a view is rendered.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ViewRecord {
+    /// Its index in the sequence as replayed.
+    pub frame: usize,
+    /// `null` where both images are equal.
+    pub psnr_db: Option<f64>,
+    pub ssim: f64,
+    /// Where the sensor has depth.
+    pub depth_l1_m: Option<f64>,
 }
 
 struct ViewFigures {
@@ -79,7 +92,9 @@ pub fn evaluate_views(
             }
             if (selection.is_held_out)(index) {
                 held_out.add(f.psnr, f.ssim, f.depth_l1);
-                on_held_out(ComparedView { frame: index, recorded: recorded.color, rendered: to_rgb8(&rendered) });
+                let psnr_db = Some(f.psnr).filter(|psnr| psnr.is_finite());
+                let figures = ViewRecord { frame: index, psnr_db, ssim: f.ssim, depth_l1_m: f.depth_l1 };
+                on_held_out(ComparedView { figures, recorded: recorded.color, rendered: to_rgb8(&rendered) });
             }
         }
     }

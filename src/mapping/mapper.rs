@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 
 use fastrand::Rng;
 use glam::{Quat, Vec3};
+use serde::{Deserialize, Serialize};
 
 pub use refine::{RefineReport, Refinement};
 
@@ -40,7 +41,7 @@ pub enum MappingError {
 }
 
 /// What happened to a keyframe.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct KeyframeReport {
     pub id: KeyframeId,
     pub seeded: usize,

@@ -12,13 +12,13 @@ use rayon::prelude::*;
 
 use super::messages::{TrackingProgress, guarded};
 use super::track_thread::{KeyframeSender, TrackSummary};
-use super::{MapperMessage, PipelineError, Progress};
+use super::{FrameRecord, MapperMessage, PipelineError, Progress};
 use crate::config::Config;
 use crate::evaluation::trajectory::MAX_TIME_DIFFERENCE_S;
 use crate::geometry::{Se3, StampedPose};
 use crate::mapping::{Keyframe, MappingConfig};
 use crate::sequence::{Frame, KnownPoint, Layout, RectifiedImage, Rectifier, Sensor, Sequence};
-use crate::tracking::KeyframePose;
+use crate::tracking::{KeyframePose, StageTimes};
 
 /// What the mapper's lengths are made for: the median distance, in metres, at which a camera sees things in a room.
 const USUAL_DISTANCE_METRES: f64 = 2.0;
@@ -178,7 +178,8 @@ pub(super) fn follow(
                 keyframe = Some(guarded("tracking", || Ok(follower.make_keyframe(&frame, world_from_camera))));
             }
         }
-        summary.times_ms.push(started.elapsed().as_secs_f64() * 1e3);
+        let times = StageTimes { features_ms: started.elapsed().as_secs_f64() * 1e3, ..StageTimes::default() };
+        summary.frames.push(FrameRecord { frame: frame.index, lost: false, times });
         let (frames_done, keyframes) = (frame.index + 1, follower.keyframes.len());
         progress.tracking.force_push(TrackingProgress { frames_done, keyframes, lost: known.is_none() });
         let message = match keyframe.transpose() {

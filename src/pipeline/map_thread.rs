@@ -1,12 +1,13 @@
 //! Maps keyframes as they come, refines the map after the last one, and publishes a snapshot after each.
 
 use std::sync::Arc;
+use std::time::Instant;
 
 use crossbeam::channel::Receiver;
 
 use super::measurements::Teller;
 use super::messages::guarded;
-use super::{MapperMessage, PipelineError, Progress};
+use super::{KeyframeRecord, MapperMessage, PipelineError, Progress};
 use crate::gpu::Gpu;
 use crate::mapping::{KeyframeReport, Mapper, MappingConfig};
 use crate::splat::{GaussianCloud, MapSnapshot};
@@ -16,7 +17,7 @@ use crate::splat::{GaussianCloud, MapSnapshot};
 pub(super) struct MapSummary {
     /// The map after the last keyframe that was finished.
     pub cloud: Arc<GaussianCloud>,
-    pub reports: Vec<KeyframeReport>,
+    pub keyframes: Vec<KeyframeRecord>,
     /// Duration of each optimisation step, milliseconds.
     pub step_ms: Vec<f64>,
     pub error: Option<PipelineError>,
@@ -42,14 +43,22 @@ pub(super) fn map(
         Ok(mapper) => mapper,
         Err(error) => return MapSummary { error: Some(error.into()), ..summary },
     };
+    let started = Instant::now();
     for message in messages.iter() {
+        let (waiting, began) = (messages.len(), Instant::now());
         let stop = || progress.stopped() || (config.yields_to_keyframes && !messages.is_empty());
         let done = guarded("mapping", || take(&mut mapper, message, tracker, &stop));
         match done {
             Ok(Taken { report, cloud }) => {
                 tracing::debug!(?report, "message taken");
-                summary.reports.extend(report);
-                let psnr_db = summary.reports.last().map_or(0.0, |r| r.psnr_db);
+                let record = |report| KeyframeRecord {
+                    report,
+                    done_s: started.elapsed().as_secs_f64(),
+                    busy_s: began.elapsed().as_secs_f64(),
+                    waiting,
+                };
+                summary.keyframes.extend(report.map(record));
+                let psnr_db = summary.keyframes.last().map_or(0.0, |k| k.report.psnr_db);
                 summary.publish(cloud, psnr_db, progress);
             }
             Err(error) => {
@@ -110,6 +119,6 @@ impl MapSummary {
     fn publish(&mut self, changed: Option<Arc<GaussianCloud>>, psnr_db: f32, progress: &Progress) {
         let Some(cloud) = changed else { return };
         self.cloud = cloud.clone();
-        progress.mapping.force_push(MapSnapshot { cloud, keyframes: self.reports.len(), psnr_db });
+        progress.mapping.force_push(MapSnapshot { cloud, keyframes: self.keyframes.len(), psnr_db });
     }
 }

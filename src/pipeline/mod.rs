@@ -10,6 +10,7 @@
 //! No lock is taken on the per-frame path. A thread that panics ends its own work; what it had is still returned.
 
 mod budget;
+mod history;
 mod known_poses;
 mod map_thread;
 mod measurements;
@@ -21,6 +22,7 @@ mod run;
 mod track_thread;
 
 pub use budget::{Budget, realtime_scale};
+pub use history::{FrameRecord, History, KeyframeRecord};
 pub use known_poses::check_known_poses;
 pub use messages::{MapperMessage, PipelineError, Progress};
 pub use recording::{Mapped, Recording, record};

@@ -5,12 +5,13 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use image::{GenericImage, RgbImage};
+use serde::Serialize;
 
 use super::Outcome;
 use crate::config::Config;
 use crate::evaluation::metrics::{Adapter, AteFigures, MappingFigures, Metrics, RpeFigures, Times, UsualTimes};
 use crate::evaluation::views::{ComparedView, ViewSelection, evaluate_views};
-use crate::evaluation::{Alignment, draw_trajectory, evaluate_trajectory, machine, sha256_hex, write_json};
+use crate::evaluation::{Alignment, Comparison, draw_trajectory, evaluate_trajectory, machine, sha256_hex, write_json};
 use crate::export::{ExportError, MapFormat, write_atomically};
 use crate::geometry::{Se3, Trajectory};
 use crate::gpu::{Gpu, GpuError};
@@ -25,6 +26,8 @@ pub const METRICS: &str = "metrics.json";
 pub const CONFIG: &str = "config.toml";
 pub const VIEWS: &str = "views";
 pub const DRAWING: &str = "trajectory.svg";
+pub const HISTORY: &str = "history.json";
+pub const COMPARISON: &str = "comparison.json";
 
 /// At most this many held-out views are kept as pictures, spread evenly.
 const MAX_PICTURES: usize = 100;
@@ -85,6 +88,7 @@ pub fn write_results(out: &Path, outcome: &Outcome, config: &Config) -> Result<W
     write_atomically(&out.join(TRAJECTORY), outcome.trajectory.to_tum().as_bytes())?;
     write_atomically(&out.join(KEYFRAMES), outcome.keyframe_trajectory().to_tum().as_bytes())?;
     write_atomically(&out.join(CONFIG), config.to_toml().as_bytes())?;
+    write_records(&out.join(HISTORY), &outcome.history)?;
     let bytes = MapFormat::Ply.write(&outcome.cloud, &out.join(MAP))?;
     Ok(WrittenMap { bytes: bytes.len() as u64, hash: sha256_hex(&bytes) })
 }
@@ -125,6 +129,7 @@ pub fn measure(
         let svg = draw_trajectory(truth, subject.trajectory, errors).map_err(OutputError::Drawing)?;
         write_atomically(&out.join(DRAWING), svg.as_bytes())?;
     }
+    let mut comparison = Comparison::of(subject.trajectory, truth.zip(all.as_ref()));
     let is_held_out = |index: usize| config.replay.is_held_out(index);
     let held_out = subject.poses.iter().filter(|(index, _)| is_held_out(*index)).count();
     let picture_every = held_out.div_ceil(MAX_PICTURES).max(1);
@@ -135,12 +140,14 @@ pub fn measure(
             picture_error = write_picture(out, &view).err();
         }
         seen += 1;
+        comparison.views.push(view.figures);
     };
     let selection = ViewSelection { poses: &subject.poses, keyframes: &subject.keyframe_indices, is_held_out: &is_held_out };
     let images = evaluate_views((sequence, config.map_scale), (gpu, subject.cloud), &selection, &mut on_held_out, progress)?;
     if let Some(error) = picture_error {
         return Err(error);
     }
+    write_records(&out.join(COMPARISON), &comparison)?;
     Ok(Measured {
         ate_rmse_m: AteFigures {
             all_frames: all.as_ref().map(|e| e.ate_rmse_m),
@@ -154,9 +161,19 @@ pub fn measure(
     })
 }
 
+/// Of a held-out view in [`VIEWS`].
+pub fn picture_name(frame: usize) -> String {
+    format!("{frame:06}.png")
+}
+
+fn write_records(path: &Path, records: &impl Serialize) -> Result<(), ExportError> {
+    let text = serde_json::to_string(records).expect("records are numbers, which JSON can hold");
+    write_atomically(path, text.as_bytes())
+}
+
 /// Recorded left, rendered right.
 fn write_picture(out: &Path, view: &ComparedView) -> Result<(), OutputError> {
-    let path = out.join(VIEWS).join(format!("{:06}.png", view.frame));
+    let path = out.join(VIEWS).join(picture_name(view.figures.frame));
     let picture_error = |source| OutputError::Picture { path: path.clone(), source };
     let (width, height) = view.recorded.dimensions();
     let mut pair = RgbImage::new(2 * width, height);

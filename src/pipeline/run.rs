@@ -12,12 +12,11 @@ use super::measurements;
 use super::messages::guarded;
 use super::read_thread::{self, ReadSummary};
 use super::track_thread::{self, TrackSummary};
-use super::{PipelineError, Progress};
+use super::{History, PipelineError, Progress};
 use crate::config::Config;
 use crate::evaluation::image::WINDOW as SSIM_WINDOW;
 use crate::geometry::{StampedPose, Trajectory};
 use crate::gpu::Gpu;
-use crate::mapping::KeyframeReport;
 use crate::sequence::{Sensor, Sequence};
 use crate::splat::GaussianCloud;
 use crate::tracking::KeyframePose;
@@ -35,7 +34,7 @@ pub struct Outcome {
     pub poses: Vec<(usize, StampedPose)>,
     pub trajectory: Trajectory,
     pub keyframes: Vec<KeyframePose>,
-    pub keyframe_reports: Vec<KeyframeReport>,
+    pub history: History,
     pub frames_read_failed: usize,
     pub frames_late: usize,
     pub keyframes_deferred: usize,
@@ -133,11 +132,11 @@ fn outcome(
         poses: track.trajectory,
         trajectory,
         keyframes: track.keyframes,
-        keyframe_reports: map.reports,
+        tracking_ms: track.frames.iter().map(|frame| frame.times.total_ms()).collect(),
+        history: History { frames: track.frames, keyframes: map.keyframes },
         frames_read_failed: read.read_failed,
         frames_late: read.late,
         keyframes_deferred: track.deferred,
-        tracking_ms: track.times_ms,
         step_ms: map.step_ms,
         wall_s: started.elapsed().as_secs_f64(),
         error: errors.into_iter().next(),

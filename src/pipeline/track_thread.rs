@@ -4,7 +4,7 @@ use crossbeam::channel::{Receiver, Sender, TrySendError};
 
 use super::measurements::Listener;
 use super::messages::{TrackingProgress, guarded};
-use super::{MapperMessage, PipelineError, Progress};
+use super::{FrameRecord, MapperMessage, PipelineError, Progress};
 use crate::config::Config;
 use crate::geometry::{StampedPose, Trajectory};
 use crate::mapping::Keyframe;
@@ -17,7 +17,7 @@ pub(super) struct TrackSummary {
     /// `(frame index, pose)` of every tracked frame, finally corrected.
     pub trajectory: Vec<(usize, StampedPose)>,
     pub keyframes: Vec<KeyframePose>,
-    pub times_ms: Vec<f64>,
+    pub frames: Vec<FrameRecord>,
     /// Paced replay: keyframes that the mapper never got.
     pub deferred: usize,
     pub error: Option<PipelineError>,
@@ -96,8 +96,8 @@ pub(super) fn track(
                 break;
             }
         };
-        summary.times_ms.push(tracked.times.total_ms());
         let lost = tracked.state == TrackingState::Lost;
+        summary.frames.push(FrameRecord { frame: frame.index, lost, times: tracked.times });
         let (frames_done, keyframes) = (frame.index + 1, tracker.keyframes().len());
         progress.tracking.force_push(TrackingProgress { frames_done, keyframes, lost });
         let keyframe = tracked.keyframe.as_ref().map(|k| k.id);

@@ -47,6 +47,7 @@ pub use relative_pose::PoseMeasurement;
 pub use tracker::Tracker;
 
 use nalgebra::Vector2;
+use serde::{Deserialize, Serialize};
 
 use crate::geometry::{Se3, StampedPose};
 
@@ -104,7 +105,7 @@ impl KeyframePose {
 }
 
 /// Wall-clock time of each stage, milliseconds; 0 where it did not run.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct StageTimes {
     /// ORB extraction and depth lookup.
     pub features_ms: f64,
