@@ -25,7 +25,7 @@ const ALLOWED: [(&str, &[&str]); 17] = [
     ("view", &["geometry", "splat", "gpu", "render"]),
     ("config", EVERYTHING_ABOVE),
     ("pipeline", EVERYTHING_ABOVE),
-    ("report", EVERYTHING_ABOVE),
+    ("report", &["evaluation", "export", "pipeline"]),
     ("cli", EVERYTHING_ABOVE),
 ];
 

@@ -1,6 +1,7 @@
 //! `keysplat bench`
 
 mod ablation;
+mod sweep;
 
 use std::path::{Path, PathBuf};
 
@@ -18,7 +19,7 @@ use keysplat::splat::{GaussianCloud, ShDegree, ViewCamera};
 use miette::{IntoDiagnostic, miette};
 use serde::Serialize;
 
-use super::run;
+use super::{Verbosity, run};
 
 #[derive(Args)]
 pub struct BenchArgs {
@@ -32,6 +33,10 @@ enum What {
     Step(StepArgs),
     /// Mappers with different settings on the same keyframes of a recording: time, Gaussians, held-out quality.
     Ablation(ablation::AblationArgs),
+    /// Whole runs over sequences, numbers of steps and seeds: what time buys, as table and curves.
+    Sweep(sweep::SweepArgs),
+    /// What got better or worse from one sweep to another.
+    Compare(sweep::CompareArgs),
 }
 
 #[derive(Args)]
@@ -102,10 +107,12 @@ struct Report {
     too_large: Vec<StepBench>,
 }
 
-pub fn bench(args: &BenchArgs) -> miette::Result<()> {
+pub fn bench(args: &BenchArgs, verbosity: Verbosity) -> miette::Result<()> {
     match &args.what {
         What::Step(args) => step(args),
         What::Ablation(args) => ablation::ablation(args),
+        What::Sweep(args) => sweep::sweep(args, verbosity),
+        What::Compare(args) => sweep::compare(args),
     }
 }
 

@@ -1,6 +1,6 @@
 //! `keysplat demo`: the synthetic room, rendered on first use, then mapped.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
@@ -14,8 +14,6 @@ use super::{Verbosity, generate, print, progress, run};
 const SCENE: &str = include_str!("../../sequences/demo.toml");
 /// The demo maps at half of its recorded size, which two cores without a GPU can do in a few minutes.
 const MAP_SCALE: f64 = 0.5;
-/// Says in the recording's folder which scene was rendered.
-const DIGEST_FILE: &str = "digest.txt";
 
 #[derive(Args)]
 pub struct DemoArgs {
@@ -27,13 +25,7 @@ pub struct DemoArgs {
 pub fn demo(args: &DemoArgs, verbosity: Verbosity) -> miette::Result<()> {
     let scene: SceneConfig = toml::from_str(SCENE).into_diagnostic()?;
     let recording = args.out.join("demo-room");
-    if !is_current(&recording, &scene) {
-        if recording.exists() {
-            std::fs::remove_dir_all(&recording).into_diagnostic()?;
-        }
-        generate::render(&scene, &recording, verbosity)?;
-        std::fs::write(recording.join(DIGEST_FILE), scene.digest()).into_diagnostic()?;
-    }
+    generate::render_if_changed(&scene, &recording, verbosity)?;
     let sequence = Some(SequenceConfig {
         path: std::path::absolute(recording).into_diagnostic()?,
         layout: None,
@@ -54,8 +46,4 @@ pub fn demo(args: &DemoArgs, verbosity: Verbosity) -> miette::Result<()> {
         map.display(),
         views.display()
     ))
-}
-
-fn is_current(recording: &Path, scene: &SceneConfig) -> bool {
-    std::fs::read_to_string(recording.join(DIGEST_FILE)).is_ok_and(|digest| digest == scene.digest())
 }

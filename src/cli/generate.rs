@@ -34,3 +34,19 @@ pub fn render(scene: &SceneConfig, out: &Path, verbosity: Verbosity) -> miette::
     bar.finish_and_clear();
     result
 }
+
+/// Says in the recording's folder which scene was rendered.
+const DIGEST_FILE: &str = "digest.txt";
+
+/// Renders a scene unless it lies there already.
+pub fn render_if_changed(scene: &SceneConfig, recording: &Path, verbosity: Verbosity) -> miette::Result<()> {
+    let digest_file = recording.join(DIGEST_FILE);
+    if std::fs::read_to_string(&digest_file).is_ok_and(|digest| digest == scene.digest()) {
+        return Ok(());
+    }
+    if recording.exists() {
+        std::fs::remove_dir_all(recording).into_diagnostic()?;
+    }
+    render(scene, recording, verbosity)?;
+    std::fs::write(&digest_file, scene.digest()).into_diagnostic()
+}

@@ -92,7 +92,7 @@ fn execute(command: Command, verbosity: Verbosity) -> miette::Result<()> {
         Command::Generate(args) => generate::generate(&args, verbosity),
         Command::Eval(args) => eval::eval(&args, verbosity),
         Command::Report(args) => report::report(&args, verbosity),
-        Command::Bench(args) => bench::bench(&args),
+        Command::Bench(args) => bench::bench(&args, verbosity),
         Command::Adapters => adapters::adapters(),
     }
 }

@@ -5,8 +5,6 @@ use crate::render::{BlendForm, Rasterizer, shaders};
 
 #[derive(Debug)]
 pub(super) struct Kernels {
-    pub select_tiles: Kernel,
-    pub fill_skipped: Kernel,
     pub loss_forward: Kernel,
     pub loss_reduce: Kernel,
     pub loss_backward: Kernel,
@@ -22,8 +20,6 @@ impl Kernels {
         let (gpu, form) = (rasterizer.gpu(), rasterizer.form());
         let kernel = |source: &shaders::ShaderSource| Kernel::new(gpu, source.name, "main", &source.text(form));
         Self {
-            select_tiles: kernel(&shaders::SELECT_TILES),
-            fill_skipped: kernel(&shaders::FILL_SKIPPED),
             loss_forward: kernel(&shaders::LOSS_FORWARD),
             loss_reduce: kernel(&shaders::LOSS_REDUCE),
             loss_backward: kernel(&shaders::LOSS_BACKWARD),

@@ -6,8 +6,10 @@ mod kernels;
 mod loss;
 mod optimiser;
 mod scores;
+mod skip;
 
 pub use adam::AdamConfig;
 pub use loss::{LossConfig, LossTerms, TargetImage};
-pub use optimiser::{Gradients, Optimiser, StepReport, TileSkip, TrainingView};
+pub use optimiser::{Gradients, Optimiser, StepReport, TrainingView};
 pub use scores::{GaussianScore, WrongPixels};
+pub use skip::TileSkip;

@@ -3,14 +3,14 @@
 use std::time::{Duration, Instant};
 
 use bytemuck::{Pod, Zeroable};
-use serde::Serialize;
 
 use super::image_buffers::{self, ImageBuffers, LOSS_TILE};
 use super::kernels::Kernels;
 use super::scores::{GaussianScore, Scores, WrongPixels};
+use super::skip::{SkippedTiles, TileSkip};
 use super::{AdamConfig, LossConfig, LossTerms, TargetImage};
 use crate::gpu::{Gpu, GpuBuffer, GpuError, workgroups};
-use crate::render::layout::{AdamSetup, COUNTERS, Counter, LossSetup, TileSkipSetup, VISIBLE_COUNTER, View};
+use crate::render::layout::{AdamSetup, COUNTERS, Counter, LossSetup, VISIBLE_COUNTER, View};
 use crate::render::{GpuCloud, PreparedView, Rasterizer, ViewCounts, cloud_from_planes};
 use crate::splat::{GaussianCloud, ViewCamera};
 
@@ -34,18 +34,6 @@ pub struct TrainingView<'a> {
     pub pace: f32,
     /// Which tiles are left out; a scored step leaves none.
     pub skip: Option<TileSkip>,
-}
-
-/// Which tiles of a view a step leaves out, by their loss when each was last worked on; unknown ones never. The reported loss is
-/// that of the whole view all the same, as far as it is known.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-pub struct TileSkip {
-    /// A tile whose loss is the view's mean is worked on in this share of the steps, one of more loss in proportion more often,
-    pub share: f32,
-    /// each in this share at least,
-    pub least: f32,
-    /// and one of less loss than this per pixel no more often.
-    pub noise: f32,
 }
 
 /// What a step leaves behind on the GPU: sums of the loss, the gradient by the pose, and the counters.
@@ -86,12 +74,12 @@ enum Sink<'a> {
 pub struct Optimiser {
     kernels: Kernels,
     scores: Scores,
+    skipped: SkippedTiles,
     /// Steps submitted so far, and the host's time to encode and submit them.
     steps: usize,
     encode_time: Duration,
     adam: GpuBuffer,
     loss_setup: GpuBuffer,
-    skip_setup: GpuBuffer,
     /// Of each size of view, the present one first.
     images: Vec<ImageBuffers>,
     gaussians: usize,
@@ -113,11 +101,11 @@ impl Optimiser {
         Ok(Self {
             kernels,
             scores: Scores::new(rasterizer)?,
+            skipped: SkippedTiles::new(rasterizer)?,
             steps: 0,
             encode_time: Duration::ZERO,
             adam: GpuBuffer::uniform(gpu, "Adam", &AdamSetup::zeroed())?,
             loss_setup: GpuBuffer::uniform(gpu, "loss setup", &LossSetup::zeroed())?,
-            skip_setup: GpuBuffer::uniform(gpu, "tile skip", &TileSkipSetup::zeroed())?,
             images: Vec::new(),
             gaussians: 0,
             loss_total: GpuBuffer::computed_uniform(gpu, "loss", 16)?,
@@ -295,7 +283,7 @@ impl Optimiser {
         }
         let mut pass = encoder.begin_compute_pass(&Default::default());
         if let Objective::Image { loss, skip: Some(skip), .. } = objective {
-            self.encode_select(&mut pass, rasterizer, loss, skip);
+            self.skipped.encode_select(&mut pass, rasterizer, &self.images[0], loss, skip);
         }
         rasterizer.encode_forward(&mut pass, cloud, &prepared);
         if let Objective::Image { loss, scored, skip, .. } = objective {
@@ -312,29 +300,12 @@ impl Optimiser {
         Ok(())
     }
 
-    /// Chooses the tiles to leave out.
-    fn encode_select(
-        &self,
-        pass: &mut wgpu::ComputePass<'_>,
-        rasterizer: &Rasterizer,
-        loss: &LossConfig,
-        (skip, seed): &(TileSkip, u32),
-    ) {
-        let (gpu, ws) = (rasterizer.gpu(), &rasterizer.workspace);
-        let TileSkip { share, least, noise } = *skip;
-        let LossConfig { ssim_weight, depth_weight, .. } = *loss;
-        self.skip_setup.write(gpu, 0, &[TileSkipSetup { share, least, noise, ssim_weight, depth_weight, seed: *seed }]);
-        let select = [(0, rasterizer.view()), (1, &self.skip_setup), (2, &self.images[0].loss_sums), (3, &ws.skipped)];
-        self.kernels.select_tiles.dispatch(gpu, pass, &select, [1, 1, 1]);
-    }
-
     fn encode_loss(&self, pass: &mut wgpu::ComputePass<'_>, rasterizer: &Rasterizer, loss: &LossConfig, skips: bool) {
         let (gpu, ws, k) = (rasterizer.gpu(), &rasterizer.workspace, &self.kernels);
         let TargetImage { width, height, color, depth, .. } = &self.images[0].target;
         let (width, height) = (*width, *height);
         if skips {
-            let fill = [(0, rasterizer.view()), (1, &ws.skipped), (2, color), (3, &ws.color_depth)];
-            k.fill_skipped.dispatch(gpu, pass, &fill, workgroups(image_buffers::tiles((width, height)) as u32));
+            self.skipped.encode_fill(pass, rasterizer, &self.images[0]);
         }
         let LossConfig { ssim_weight, depth_weight, precise_depth_metres: precise_depth } = *loss;
         let setup = LossSetup { width, height, ssim_weight, depth_weight, precise_depth };

@@ -1,7 +1,9 @@
 //! `keysplat report`: a run's folder as one HTML file that needs nothing else, no network either.
 
+pub mod curves;
 mod page;
 mod plots;
+pub mod sweep;
 
 use std::path::{Path, PathBuf};
 

@@ -33,12 +33,12 @@ pub(super) struct AblationArgs {
 
 /// Settings that differ from the base.
 #[derive(Clone, Debug, Serialize)]
-struct Variant {
-    name: String,
-    settings: Vec<String>,
+pub(super) struct Variant {
+    pub name: String,
+    pub settings: Vec<String>,
 }
 
-fn parse_variant(text: &str) -> Result<Variant, String> {
+pub(super) fn parse_variant(text: &str) -> Result<Variant, String> {
     let (name, settings) = text.split_once(':').ok_or("write NAME: KEY=VALUE KEY=VALUE")?;
     Ok(Variant { name: name.trim().into(), settings: settings.split_whitespace().map(Into::into).collect() })
 }

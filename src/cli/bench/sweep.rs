@@ -1,0 +1,219 @@
+//! `keysplat bench sweep` and `keysplat bench compare`
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+
+use clap::Args;
+use keysplat::evaluation::{Metrics, machine};
+use keysplat::export::write_atomically;
+use keysplat::pipeline::outputs;
+use keysplat::report::curves;
+use keysplat::report::sweep::{Sweep, SweepRow, Verdict, compare as changes, points, to_csv, to_markdown, with_spread};
+use keysplat::sequence::synthetic::SceneConfig;
+use miette::{IntoDiagnostic, miette};
+
+use super::ablation::{Variant, parse_variant};
+use crate::cli::{Verbosity, generate, print, progress};
+
+/// Scenes that need no recording.
+const SCENES: [(&str, &str); 3] = [
+    ("demo", include_str!("../../../sequences/demo.toml")),
+    ("room-clean", include_str!("../../../sequences/room-clean.toml")),
+    ("room-noisy", include_str!("../../../sequences/room-noisy.toml")),
+];
+/// What made a run, in its folder: a run of the same is not made again.
+const MADE_BY: &str = "made-by.json";
+
+#[derive(Args)]
+pub(super) struct SweepArgs {
+    /// Recordings, or names of synthetic scenes: demo, room-clean, room-noisy.
+    #[arg(required = true)]
+    sequences: Vec<String>,
+    /// Folder for all runs, sweep.csv, sweep.json, sweep.md and curves.svg; a sweep that was interrupted goes on there.
+    #[arg(short, long)]
+    out: PathBuf,
+    /// Steps after each keyframe: each number is a point of the curves.
+    #[arg(long, value_delimiter = ',', default_values_t = [12usize, 25, 50, 100])]
+    iterations: Vec<usize>,
+    /// Seeds: each point is run with all of them.
+    #[arg(long, value_delimiter = ',', default_values_t = [0u64])]
+    seeds: Vec<u64>,
+    /// A variant: its name and the settings in which it differs, run with all numbers of steps (may be given again).
+    #[arg(long = "variant", value_name = "NAME: KEY=VALUE …", value_parser = parse_variant)]
+    variants: Vec<Variant>,
+    /// Options of `keysplat run` for all runs, e.g. -- --map-scale 0.5 --frames 0..200
+    #[arg(last = true)]
+    run: Vec<String>,
+}
+
+#[derive(Args)]
+pub(super) struct CompareArgs {
+    /// Folder of the earlier sweep.
+    before: PathBuf,
+    /// Folder of the later one.
+    after: PathBuf,
+    /// End with an error if anything got worse beyond the spread.
+    #[arg(long)]
+    fail: bool,
+}
+
+/// One run to be made.
+struct Cell {
+    sequence: String,
+    recording: PathBuf,
+    variant: String,
+    seed: u64,
+    options: Vec<String>,
+    out: PathBuf,
+}
+
+pub(super) fn sweep(args: &SweepArgs, verbosity: Verbosity) -> miette::Result<()> {
+    std::fs::create_dir_all(&args.out).into_diagnostic()?;
+    let cells = cells(args, verbosity)?;
+    let bar = progress::bar(verbosity, cells.len() as u64, "{wide_bar} {pos}/{len} runs  {msg}");
+    let (mut rows, mut machine) = (Vec::new(), None);
+    for cell in &cells {
+        bar.set_message(format!("{} {} seed {}", cell.sequence, cell.variant, cell.seed));
+        let metrics = cell.measure()?;
+        rows.push(SweepRow::new(&cell.sequence, &cell.variant, cell.seed, &metrics));
+        machine = Some(metrics);
+        bar.inc(1);
+    }
+    bar.finish_and_clear();
+    let adapter = machine.and_then(|m| m.adapter).map_or_else(String::new, |a| format!("{}, {}", a.name, a.driver));
+    let sweep = Sweep {
+        adapter,
+        cpu: machine::cpu_name(),
+        threads: std::thread::available_parallelism().map_or(1, |n| n.get() as u64),
+        version: env!("CARGO_PKG_VERSION").into(),
+        rows,
+    };
+    let table = to_markdown(&sweep.rows);
+    let svg = curves::draw(&points(&sweep.rows)).map_err(|e| miette!("cannot draw the curves: {e}; please report this"))?;
+    let json = serde_json::to_string_pretty(&sweep).into_diagnostic()?;
+    for (name, text) in [("sweep.json", &json), ("sweep.csv", &to_csv(&sweep.rows)), ("sweep.md", &table), ("curves.svg", &svg)] {
+        write_atomically(&args.out.join(name), text.as_bytes()).into_diagnostic()?;
+    }
+    print(&table)
+}
+
+fn cells(args: &SweepArgs, verbosity: Verbosity) -> miette::Result<Vec<Cell>> {
+    let plain = [Variant { name: String::new(), settings: Vec::new() }];
+    let variants = if args.variants.is_empty() { &plain[..] } else { &args.variants };
+    let mut cells = Vec::new();
+    for sequence in &args.sequences {
+        let (name, recording) = recording(sequence, &args.out, verbosity)?;
+        for variant in variants {
+            for &iterations in &args.iterations {
+                for &seed in &args.seeds {
+                    let steps = format!("{iterations} steps");
+                    let variant_name = if variant.name.is_empty() { steps } else { format!("{}, {steps}", variant.name) };
+                    let mut options = args.run.clone();
+                    let settings = [
+                        format!("mapping.iterations_per_keyframe={iterations}"),
+                        format!("mapping.first_iterations={}", 2 * iterations),
+                        format!("mapping.seed={seed}"),
+                    ];
+                    for setting in settings.iter().chain(&variant.settings) {
+                        options.extend(["--set".into(), setting.clone()]);
+                    }
+                    let folder = format!("{}-{seed}", slug(&variant_name));
+                    let out = args.out.join("runs").join(slug(&name)).join(folder);
+                    cells.push(Cell {
+                        sequence: name.clone(),
+                        recording: recording.clone(),
+                        variant: variant_name,
+                        seed,
+                        options,
+                        out,
+                    });
+                }
+            }
+        }
+    }
+    Ok(cells)
+}
+
+/// A name that any file system takes.
+fn slug(name: &str) -> String {
+    name.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '-' }).collect()
+}
+
+/// A recording's name and folder; synthetic scenes are rendered where they are not yet.
+fn recording(sequence: &str, out: &Path, verbosity: Verbosity) -> miette::Result<(String, PathBuf)> {
+    let path = Path::new(sequence);
+    if path.exists() {
+        let name = path.file_stem().map_or_else(|| sequence.into(), |name| name.to_string_lossy().into_owned());
+        return Ok((name, path.into()));
+    }
+    let Some((name, scene)) = SCENES.iter().find(|(name, _)| *name == sequence) else {
+        let names: Vec<&str> = SCENES.iter().map(|(name, _)| *name).collect();
+        return Err(miette!("there is no recording {sequence}; give its folder, or a synthetic scene: {}", names.join(", ")));
+    };
+    let scene: SceneConfig = toml::from_str(scene).into_diagnostic()?;
+    let folder = out.join("recordings").join(name);
+    generate::render_if_changed(&scene, &folder, verbosity)?;
+    Ok(((*name).into(), folder))
+}
+
+impl Cell {
+    /// The run's figures; made by a process of its own, so that its memory is its own, unless it was made already.
+    fn measure(&self) -> miette::Result<Metrics> {
+        let made_by =
+            serde_json::json!({ "recording": self.recording, "options": self.options, "version": env!("CARGO_PKG_VERSION") });
+        let made_by = made_by.to_string();
+        let metrics = self.out.join(outputs::METRICS);
+        let is_made = std::fs::read_to_string(self.out.join(MADE_BY)).is_ok_and(|text| text == made_by) && metrics.is_file();
+        if !is_made {
+            let program = std::env::current_exe().into_diagnostic()?;
+            let output = Command::new(program)
+                .arg("run")
+                .arg(&self.recording)
+                .arg("--out")
+                .arg(&self.out)
+                .args(&self.options)
+                .arg("--quiet")
+                .stdin(Stdio::null())
+                .output()
+                .into_diagnostic()?;
+            if !output.status.success() {
+                let said = String::from_utf8_lossy(&output.stderr);
+                return Err(miette!("the run into {} failed; what is done stays done.\n{}", self.out.display(), said.trim()));
+            }
+            write_atomically(&self.out.join(MADE_BY), made_by.as_bytes()).into_diagnostic()?;
+        }
+        let text = std::fs::read_to_string(&metrics).into_diagnostic()?;
+        serde_json::from_str(&text).map_err(|error| miette!("{} is damaged ({error}); remove the folder", metrics.display()))
+    }
+}
+
+pub(super) fn compare(args: &CompareArgs) -> miette::Result<()> {
+    let read = |folder: &Path| -> miette::Result<Sweep> {
+        let path = folder.join("sweep.json");
+        let text =
+            std::fs::read_to_string(&path).map_err(|e| miette!("cannot read {}: {e}; give a sweep's folder", path.display()))?;
+        serde_json::from_str(&text).map_err(|e| miette!("{} is no sweep of this version: {e}", path.display()))
+    };
+    let (before, after) = (read(&args.before)?, read(&args.after)?);
+    let machine = |s: &Sweep| (s.adapter.clone(), s.cpu.clone(), s.threads);
+    if machine(&before) != machine(&after) {
+        tracing::warn!("the sweeps ran on different machines: their times do not compare");
+    }
+    let changes = changes(&before.rows, &after.rows);
+    if changes.is_empty() {
+        return Err(miette!("the sweeps have no sequence and variant in common"));
+    }
+    let mut table = String::from("| sequence | variant | figure | before | after | |\n|---|---|---|---|---|---|\n");
+    for c in &changes {
+        let verdict = match c.verdict {
+            Verdict::Better => "better",
+            Verdict::Worse => "**worse**",
+            Verdict::Same => "",
+        };
+        let (before, after) = (with_spread(c.figure, &c.before), with_spread(c.figure, &c.after));
+        table += &format!("| {} | {} | {} | {before} | {after} | {verdict} |\n", c.sequence, c.variant, c.figure.name());
+    }
+    print(&table)?;
+    let worse = changes.iter().filter(|c| c.verdict == Verdict::Worse).count();
+    if args.fail && worse > 0 { Err(miette!("{worse} figures got worse beyond the spread")) } else { Ok(()) }
+}

@@ -1,0 +1,337 @@
+//! Many runs side by side: what time buys. Medians and spreads over seeds, Pareto fronts, and whether one sweep is better than another.
+
+use std::collections::BTreeMap;
+use std::fmt::Write;
+
+use serde::{Deserialize, Serialize};
+
+use crate::evaluation::Metrics;
+
+/// One run of a sweep.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct SweepRow {
+    pub sequence: String,
+    pub variant: String,
+    pub seed: u64,
+    pub frames: u64,
+    pub frames_tracked: u64,
+    /// The whole run.
+    pub wall_s: f64,
+    pub ate_rmse_m: Option<f64>,
+    /// Held-out views.
+    pub psnr_db: Option<f64>,
+    pub ssim: Option<f64>,
+    pub depth_l1_m: Option<f64>,
+    pub gaussians: Option<u64>,
+    pub iterations: Option<u64>,
+    pub peak_host_bytes: Option<u64>,
+    pub map_hash: Option<String>,
+}
+
+/// A sweep with the machine that it ran on: `sweep.json`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Sweep {
+    pub adapter: String,
+    pub cpu: Option<String>,
+    pub threads: u64,
+    pub version: String,
+    pub rows: Vec<SweepRow>,
+}
+
+/// Median, least and most of some runs.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Spread {
+    pub median: f64,
+    pub least: f64,
+    pub most: f64,
+}
+
+/// The runs of a variant on a sequence.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Point {
+    pub sequence: String,
+    pub variant: String,
+    pub runs: usize,
+    pub wall_s: Spread,
+    pub ate_cm: Option<Spread>,
+    pub psnr_db: Option<Spread>,
+    pub gaussians: Option<Spread>,
+}
+
+/// What is compared over time, and which way is better.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Figure {
+    Time,
+    Ate,
+    Psnr,
+    Gaussians,
+}
+
+/// A figure that two sweeps have in common.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Change {
+    pub sequence: String,
+    pub variant: String,
+    pub figure: Figure,
+    pub before: Spread,
+    pub after: Spread,
+    pub verdict: Verdict,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Verdict {
+    Better,
+    Worse,
+    /// Within the spread.
+    Same,
+}
+
+impl SweepRow {
+    pub fn new(sequence: &str, variant: &str, seed: u64, m: &Metrics) -> Self {
+        let held_out = m.images.held_out;
+        Self {
+            sequence: sequence.into(),
+            variant: variant.into(),
+            seed,
+            frames: m.frames,
+            frames_tracked: m.frames_tracked,
+            wall_s: m.wall_s.unwrap_or_default(),
+            ate_rmse_m: m.ate_rmse_m.all_frames,
+            psnr_db: held_out.and_then(|h| h.psnr_db),
+            ssim: held_out.and_then(|h| h.ssim),
+            depth_l1_m: held_out.and_then(|h| h.depth_l1_m),
+            gaussians: m.gaussians,
+            iterations: m.mapping.map(|mapping| mapping.iterations),
+            peak_host_bytes: m.peak_host_bytes,
+            map_hash: m.map_hash.clone(),
+        }
+    }
+}
+
+impl Spread {
+    /// `None` without values, or where one is not finite.
+    fn of(values: impl Iterator<Item = f64>) -> Option<Self> {
+        let mut values: Vec<f64> = values.collect();
+        values.sort_by(f64::total_cmp);
+        let n = values.len();
+        let finite = n > 0 && values.iter().all(|v| v.is_finite());
+        finite.then(|| Self { median: (values[(n - 1) / 2] + values[n / 2]) / 2.0, least: values[0], most: values[n - 1] })
+    }
+}
+
+impl Figure {
+    pub const ALL: [Self; 4] = [Self::Time, Self::Ate, Self::Psnr, Self::Gaussians];
+
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Time => "whole run, s",
+            Self::Ate => "ATE RMSE, cm",
+            Self::Psnr => "held-out PSNR, dB",
+            Self::Gaussians => "Gaussians",
+        }
+    }
+
+    pub fn of(self, point: &Point) -> Option<Spread> {
+        match self {
+            Self::Time => Some(point.wall_s),
+            Self::Ate => point.ate_cm,
+            Self::Psnr => point.psnr_db,
+            Self::Gaussians => point.gaussians,
+        }
+    }
+
+    /// Smaller is better, whatever the figure.
+    pub fn cost(self, value: f64) -> f64 {
+        if self == Self::Psnr { -value } else { value }
+    }
+
+    /// What a difference must exceed to count, beside the spread: few runs do not show all of it.
+    fn tolerance(self, value: f64) -> f64 {
+        match self {
+            Self::Time => 0.1 * value,
+            Self::Ate => 0.05 * value,
+            Self::Psnr => 0.2,
+            Self::Gaussians => 0.03 * value,
+        }
+    }
+}
+
+/// The points of a sweep, in the order of its rows.
+pub fn points(rows: &[SweepRow]) -> Vec<Point> {
+    let mut order: Vec<(&str, &str)> = Vec::new();
+    let mut groups: BTreeMap<(&str, &str), Vec<&SweepRow>> = BTreeMap::new();
+    for row in rows {
+        let key = (row.sequence.as_str(), row.variant.as_str());
+        let group = groups.entry(key).or_default();
+        if group.is_empty() {
+            order.push(key);
+        }
+        group.push(row);
+    }
+    let point = |key: &(&str, &str)| {
+        let group = &groups[key];
+        // A figure that one run lacks has no median.
+        let spread = |value: &dyn Fn(&SweepRow) -> Option<f64>| {
+            let values: Vec<f64> = group.iter().filter_map(|row| value(row)).collect();
+            if values.len() == group.len() { Spread::of(values.into_iter()) } else { None }
+        };
+        Point {
+            sequence: key.0.into(),
+            variant: key.1.into(),
+            runs: group.len(),
+            wall_s: spread(&|row| Some(row.wall_s)).unwrap_or(Spread { median: 0.0, least: 0.0, most: 0.0 }),
+            ate_cm: spread(&|row| row.ate_rmse_m.map(|v| 100.0 * v)),
+            psnr_db: spread(&|row| row.psnr_db),
+            gaussians: spread(&|row| row.gaussians.map(|g| g as f64)),
+        }
+    };
+    order.iter().map(point).collect()
+}
+
+/// Which of `(time, cost)` nobody undercuts in both; of equal ones all.
+pub fn pareto(points: &[(f64, f64)]) -> Vec<bool> {
+    let beats = |a: &(f64, f64), b: &(f64, f64)| a.0 <= b.0 && a.1 <= b.1 && a != b;
+    points.iter().map(|p| !points.iter().any(|other| beats(other, p))).collect()
+}
+
+/// What both sweeps measured, and how it changed.
+pub fn compare(before: &[SweepRow], after: &[SweepRow]) -> Vec<Change> {
+    let before = points(before);
+    let mut changes = Vec::new();
+    for now in points(after) {
+        let Some(then) = before.iter().find(|p| (&p.sequence, &p.variant) == (&now.sequence, &now.variant)) else { continue };
+        for figure in Figure::ALL {
+            let (Some(a), Some(b)) = (figure.of(then), figure.of(&now)) else { continue };
+            let change = figure.cost(b.median) - figure.cost(a.median);
+            let apart = a.most < b.least || b.most < a.least;
+            let counts = apart && change.abs() > figure.tolerance(a.median);
+            let verdict = match counts {
+                false => Verdict::Same,
+                true if change < 0.0 => Verdict::Better,
+                true => Verdict::Worse,
+            };
+            let (sequence, variant) = (now.sequence.clone(), now.variant.clone());
+            changes.push(Change { sequence, variant, figure, before: a, after: b, verdict });
+        }
+    }
+    changes
+}
+
+/// Rows as CSV with a header; empty where a figure does not apply.
+pub fn to_csv(rows: &[SweepRow]) -> String {
+    fn cell<T: ToString>(value: Option<T>) -> String {
+        value.map_or_else(String::new, |v| v.to_string())
+    }
+    let quoted = |text: &str| format!("\"{}\"", text.replace('"', "\"\""));
+    let mut csv = String::from(
+        "sequence,variant,seed,frames,frames_tracked,wall_s,ate_rmse_m,psnr_db,ssim,depth_l1_m,gaussians,iterations,peak_host_bytes,map_hash\n",
+    );
+    for r in rows {
+        let _ = writeln!(
+            csv,
+            "{},{},{},{},{},{},{},{},{},{},{},{},{},{}",
+            quoted(&r.sequence),
+            quoted(&r.variant),
+            r.seed,
+            r.frames,
+            r.frames_tracked,
+            r.wall_s,
+            cell(r.ate_rmse_m),
+            cell(r.psnr_db),
+            cell(r.ssim),
+            cell(r.depth_l1_m),
+            cell(r.gaussians),
+            cell(r.iterations),
+            cell(r.peak_host_bytes),
+            cell(r.map_hash.as_deref())
+        );
+    }
+    csv
+}
+
+/// The points as a table in Markdown, each figure with its spread where there is one.
+pub fn to_markdown(rows: &[SweepRow]) -> String {
+    let names = Figure::ALL.map(Figure::name).join(" | ");
+    let mut table = format!("| sequence | variant | runs | {names} |");
+    table += "\n|---|---|---|---|---|---|---|\n";
+    for point in points(rows) {
+        let _ = write!(table, "| {} | {} | {} |", point.sequence, point.variant, point.runs);
+        for figure in Figure::ALL {
+            let _ = write!(table, " {} |", figure.of(&point).map_or_else(|| "–".into(), |s| with_spread(figure, &s)));
+        }
+        table.push('\n');
+    }
+    table
+}
+
+/// A median and, where runs differ, their range.
+pub fn with_spread(figure: Figure, s: &Spread) -> String {
+    let decimals = match figure {
+        Figure::Time => 1,
+        Figure::Ate | Figure::Psnr => 2,
+        Figure::Gaussians => 0,
+    };
+    let median = format!("{:.decimals$}", s.median);
+    if s.least == s.most { median } else { format!("{median} ({:.decimals$}–{:.decimals$})", s.least, s.most) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn row(variant: &str, seed: u64, wall_s: f64, psnr_db: f64) -> SweepRow {
+        SweepRow {
+            sequence: "room".into(),
+            variant: variant.into(),
+            seed,
+            frames: 10,
+            frames_tracked: 10,
+            wall_s,
+            ate_rmse_m: None,
+            psnr_db: Some(psnr_db),
+            ssim: None,
+            depth_l1_m: None,
+            gaussians: Some(1000),
+            iterations: None,
+            peak_host_bytes: None,
+            map_hash: None,
+        }
+    }
+
+    #[test]
+    fn seeds_become_a_median_with_its_spread() {
+        let rows = [row("b", 0, 10.0, 30.0), row("a", 0, 20.0, 31.0), row("b", 1, 14.0, 28.0), row("b", 2, 11.0, 31.0)];
+        let points = points(&rows);
+        assert_eq!(points.iter().map(|p| (p.variant.as_str(), p.runs)).collect::<Vec<_>>(), [("b", 3), ("a", 1)]);
+        assert_eq!(points[0].wall_s, Spread { median: 11.0, least: 10.0, most: 14.0 });
+        assert_eq!(points[0].psnr_db, Some(Spread { median: 30.0, least: 28.0, most: 31.0 }));
+        assert_eq!(points[0].ate_cm, None);
+    }
+
+    #[test]
+    fn the_front_is_what_nobody_undercuts() {
+        let front = pareto(&[(1.0, 9.0), (2.0, 5.0), (3.0, 6.0), (4.0, 1.0), (4.0, 1.0), (5.0, 1.0)]);
+        assert_eq!(front, [true, true, false, true, true, false]);
+    }
+
+    #[test]
+    fn only_what_exceeds_the_spread_counts_as_a_change() {
+        let before = [row("a", 0, 10.0, 30.0), row("a", 1, 13.0, 30.5), row("gone", 0, 1.0, 1.0)];
+        let after = [row("a", 0, 12.0, 28.0), row("a", 1, 20.0, 28.5), row("new", 0, 1.0, 1.0)];
+        let changes = compare(&before, &after);
+        let of = |figure| changes.iter().find(|c| c.figure == figure).map(|c| c.verdict);
+        assert_eq!(of(Figure::Time), Some(Verdict::Same), "the ranges overlap");
+        assert_eq!(of(Figure::Psnr), Some(Verdict::Worse));
+        assert_eq!(of(Figure::Gaussians), Some(Verdict::Same));
+        assert_eq!(of(Figure::Ate), None);
+        assert_eq!(compare(&after, &before).iter().find(|c| c.figure == Figure::Psnr).map(|c| c.verdict), Some(Verdict::Better));
+    }
+
+    #[test]
+    fn csv_has_a_cell_for_each_name() {
+        let csv = to_csv(&[row("a, \"b\"", 0, 1.5, 30.0)]);
+        let [header, line] = csv.lines().collect::<Vec<_>>()[..] else { panic!("{csv}") };
+        assert!(line.starts_with("\"room\",\"a, \"\"b\"\"\",0,10,10,1.5,,30,,,1000,"));
+        assert_eq!(header.split(',').count(), line.replace("a, ", "a").split(',').count());
+    }
+}

@@ -1,0 +1,62 @@
+//! Sweeps as the program makes them: tables and curves, going on where one was interrupted, and one sweep against another.
+
+mod common;
+
+use common::recording::{Finished, finish, keysplat, recording, scratch, skipped_without_adapter};
+use std::path::Path;
+
+fn sweep(out: &Path) -> Finished {
+    let mut command =
+        keysplat(["bench", "sweep", recording().to_str().unwrap(), "--iterations", "2,6", "--seeds", "0,1", "--out"]);
+    command.arg(out).args(["--", "--set", "mapping.window.recent=3"]);
+    finish(command)
+}
+
+fn compare(before: &Path, after: &Path) -> Finished {
+    finish(keysplat(["bench".as_ref(), "compare".as_ref(), before.as_os_str(), after.as_os_str(), "--fail".as_ref()]))
+}
+
+#[test]
+fn a_sweep_is_made_once_and_compared() {
+    if skipped_without_adapter() {
+        return;
+    }
+    let out = scratch().join("sweep");
+    let table = sweep(&out).succeeded().stdout;
+    assert_eq!(table.lines().filter(|line| line.starts_with("| recording |")).count(), 2, "{table}");
+    let csv = std::fs::read_to_string(out.join("sweep.csv")).unwrap();
+    assert_eq!(csv.lines().count(), 5, "{csv}");
+    assert!(csv.contains("\"recording\",\"6 steps\",1,24,24,"), "{csv}");
+    let svg = std::fs::read_to_string(out.join("curves.svg")).unwrap();
+    assert!(svg.starts_with("<svg") && svg.contains("held-out PSNR, dB"));
+
+    // One run is gone: it alone is made again.
+    let runs = out.join("runs/recording");
+    let made = |name: &str| std::fs::metadata(runs.join(name).join("map.ply")).unwrap().modified().unwrap();
+    let (kept, lost) = (made("2-steps-0"), made("6-steps-1"));
+    std::fs::remove_file(runs.join("6-steps-1/metrics.json")).unwrap();
+    sweep(&out).succeeded();
+    assert_eq!(made("2-steps-0"), kept);
+    assert!(made("6-steps-1") > lost);
+
+    let same = compare(&out, &out).succeeded().stdout;
+    assert!(!same.contains("worse") && !same.contains("better"), "{same}");
+    let worse = scratch().join("worse");
+    std::fs::create_dir_all(&worse).unwrap();
+    let json = std::fs::read_to_string(out.join("sweep.json")).unwrap();
+    let mut sweep: serde_json::Value = serde_json::from_str(&json).unwrap();
+    for row in sweep["rows"].as_array_mut().unwrap() {
+        row["psnr_db"] = (row["psnr_db"].as_f64().unwrap() - 8.0).into();
+    }
+    std::fs::write(worse.join("sweep.json"), sweep.to_string()).unwrap();
+    compare(&out, &worse).refused(&["2 figures got worse beyond the spread"]);
+    compare(&worse, &out).succeeded();
+}
+
+#[test]
+fn what_cannot_be_swept_or_compared_is_said() {
+    let out = scratch().join("nothing");
+    let wrong = keysplat(["bench".as_ref(), "sweep".as_ref(), "no-such-room".as_ref(), "--out".as_ref(), out.as_os_str()]);
+    finish(wrong).refused(&["no-such-room", "room-clean"]);
+    compare(&out, &out).refused(&["sweep.json", "give a sweep's folder"]);
+}
