@@ -13,6 +13,8 @@ struct AdamSetup {
     log_beta_2: f32,
     // 1 on the steps that move the higher harmonics, else 0.
     step_harmonics: u32,
+    // Logarithm of how many times longer than its second axis a Gaussian's longest may become.
+    log_elongation: f32,
 }
 
 @group(0) @binding(6) var<storage, read_write> parameters: array<vec4<f32>>;
@@ -47,6 +49,14 @@ fn wants_harmonics() -> bool {
     return min(adam.step_harmonics, arrayLength(&parameters)) == 1u;
 }
 
+// Log scales without a needle's tip: needles fit one view's edge and stick out of all others.
+fn blunt(log_scale: vec4<f32>) -> vec4<f32> {
+    let longest = max(max(log_scale.x, log_scale.y), log_scale.z);
+    let shortest = min(min(log_scale.x, log_scale.y), log_scale.z);
+    let second = log_scale.x + log_scale.y + log_scale.z - longest - shortest;
+    return vec4(min(log_scale.xyz, vec3(second + adam.log_elongation)), log_scale.w);
+}
+
 fn store_gradient(plane: u32, i: u32, raw: vec4<f32>) {
     let at = plane * view.capacity + i;
     let correction = select(corrections, corrections_of_harmonics, plane > 3u);
@@ -57,7 +67,8 @@ fn store_gradient(plane: u32, i: u32, raw: vec4<f32>) {
     let v = mix(gradient * gradient, moments_2[at], adam.beta_2);
     let unit = select(vec4(1.0), vec4(size, size, size, 1.0), plane == 0u);
     let rate = adam.rates[min(plane, 4u)] * unit * correction.x;
-    parameters[at] -= rate * m / (sqrt(v * correction.y) + adam.epsilon);
+    let moved = parameters[at] - rate * m / (sqrt(v * correction.y) + adam.epsilon);
+    parameters[at] = select(moved, blunt(moved), plane == 1u);
     moments_1[at] = select(m, vec4(m.xyz, before.w), plane == 1u || plane == 3u);
     moments_2[at] = v;
 }

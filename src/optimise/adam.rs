@@ -29,6 +29,8 @@ pub struct AdamConfig {
     pub beta_1: f32,
     pub beta_2: f32,
     pub epsilon: f32,
+    /// How many times longer than its second axis a Gaussian's longest may become.
+    pub max_elongation: f32,
 }
 
 impl Default for AdamConfig {
@@ -44,6 +46,7 @@ impl Default for AdamConfig {
             beta_1: 0.9,
             beta_2: 0.999,
             epsilon: 1e-15,
+            max_elongation: 8.0,
         }
     }
 }
@@ -61,6 +64,9 @@ impl AdamConfig {
         }
         if ![self.beta_1, self.beta_2].iter().all(|beta| (0.0..1.0).contains(beta)) || self.beta_1 == 0.0 || self.beta_2 == 0.0 {
             return Err("beta_1 and beta_2 must lie between 0 and 1, both excluded".into());
+        }
+        if !(self.max_elongation.is_finite() && self.max_elongation > 1.0) {
+            return Err("max_elongation must be greater than 1".into());
         }
         if self.epsilon.is_finite() && self.epsilon > 0.0 { Ok(()) } else { Err("epsilon must be positive".into()) }
     }
@@ -99,7 +105,8 @@ impl AdamConfig {
             log_beta_1: self.beta_1.ln(),
             log_beta_2: self.beta_2.ln(),
             step_harmonics: u32::from(step.is_multiple_of(self.harmonics_every)),
-            pad: [0.0; 2],
+            log_elongation: self.max_elongation.ln(),
+            pad: 0.0,
         }
     }
 }

@@ -226,7 +226,8 @@ host_twins! {
         log_beta_1: f32,
         log_beta_2: f32,
         step_harmonics: u32,
-        pad: [f32; 2],
+        log_elongation: f32,
+        pad: f32,
     }
 }
 
