@@ -41,15 +41,11 @@ impl Budget {
                 "mapping.yields_to_keyframes=true",
                 "mapping.first_iterations=10",
                 "mapping.iterations_per_keyframe=200",
-                "mapping.seeding.stride=2",
-                "mapping.seeding.flat_stride=8",
                 "mapping.window.recent=4",
                 "mapping.window.covisible=2",
             ],
             Self::Balanced => &[],
-            Self::Quality => {
-                &["mapping.iterations_per_keyframe=120", "mapping.seeding.stride=2", "mapping.seeding.flat_stride=4"]
-            }
+            Self::Quality => &["mapping.iterations_per_keyframe=100", "mapping.seeding.detail=0.04"],
         }
     }
 
