@@ -275,9 +275,11 @@ impl Mapper {
     }
 
     fn steps(&mut self, batch: &[Step], scored: Option<WrongPixels>) -> Result<Vec<StepReport>, MappingError> {
+        // A pose is refined by its whole image.
+        let skip = self.config.skip.tiles().filter(|_| !self.config.refine_poses.enabled);
         let view = |step: &Step| {
             self.keyframes[step.keyframe]
-                .view(step.coarse, step.pace, (scored, self.config.skip.tiles()))
+                .view(step.coarse, step.pace, (scored, skip))
                 .expect("only keyframes with images are drawn")
         };
         let views: Vec<TrainingView<'_>> = batch.iter().map(view).collect();
