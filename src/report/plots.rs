@@ -86,8 +86,8 @@ fn lines(
 pub fn color_of(share: f64) -> RGBColor {
     const STOPS: [[f64; 3]; 5] =
         [[68.0, 1.0, 84.0], [59.0, 82.0, 139.0], [33.0, 145.0, 140.0], [94.0, 201.0, 98.0], [253.0, 231.0, 37.0]];
-    // Unlike clamp, takes NaN for 0.
-    let at = share.max(0.0).min(1.0) * 4.0;
+    let share = if share.is_nan() { 0.0 } else { share.clamp(0.0, 1.0) };
+    let at = share * 4.0;
     let (k, t) = ((at as usize).min(3), at - (at as usize).min(3) as f64);
     let channel = |c: usize| (STOPS[k][c] + t * (STOPS[k + 1][c] - STOPS[k][c])).round() as u8;
     RGBColor(channel(0), channel(1), channel(2))
