@@ -15,19 +15,6 @@ use nalgebra::Vector3;
 
 const TOLERANCE: f64 = 1e-3;
 
-/// Adam that moves nothing, so that both views score the same map.
-fn still() -> AdamConfig {
-    AdamConfig {
-        position_rate: 0.0,
-        opacity_rate: 0.0,
-        scale_rate: 0.0,
-        rotation_rate: 0.0,
-        color_rate: 0.0,
-        harmonics_rate: 0.0,
-        ..AdamConfig::default()
-    }
-}
-
 #[test]
 fn scores_are_those_of_their_definition() {
     let Ok(gpu) = Gpu::open(None) else {
@@ -64,7 +51,9 @@ fn scores_are_those_of_their_definition() {
         let target = TargetImage::new(&gpu, &image, None).unwrap();
         let view = TrainingView { camera, target: &target, scored: Some(wrong_config), pace: 1.0, skip: None };
         optimiser.begin_scores(&gpu, &on_gpu).unwrap();
-        optimiser.steps(&mut rasterizer, &on_gpu, &[view; 2], (&loss_config, &still())).unwrap();
+        // Nothing moves, so that both views score the same map.
+        let still = AdamConfig::default().scaled(0.0, 0.0);
+        optimiser.steps(&mut rasterizer, &on_gpu, &[view; 2], (&loss_config, &still)).unwrap();
         let found = optimiser.read_scores(&gpu, &on_gpu).unwrap();
 
         let compare = |name: &str, found: Vec<f32>, expected: Vec<f64>| {

@@ -89,15 +89,7 @@ impl StepRunner {
         let optimiser = Optimiser::new(&rasterizer)?;
         let work = count_work(&mut rasterizer, &scene.cloud, &scene.camera)?;
         // Rates of zero keep the scene as it is, step after step, at the same cost.
-        let still = AdamConfig {
-            position_rate: 0.0,
-            opacity_rate: 0.0,
-            scale_rate: 0.0,
-            rotation_rate: 0.0,
-            color_rate: 0.0,
-            harmonics_rate: 0.0,
-            ..AdamConfig::default()
-        };
+        let still = AdamConfig::default().scaled(0.0, 0.0);
         let mut runner = Self { gpu: gpu.clone(), scene, rasterizer, optimiser, still, skip, work };
         for _ in 0..WARM_UP {
             runner.steps(1)?;

@@ -25,8 +25,9 @@ pub enum Budget {
 
 /// Shares of the recorded resolution that real time may choose.
 const SCALES: [f64; 6] = [1.0, 0.75, 0.5, 0.375, 0.25, 0.125];
-/// A step should take no longer: some ten of them fit between two keyframes of a walking camera.
-const STEP: Duration = Duration::from_millis(25);
+/// A step should take no longer when it has the machine to itself: beside the tracker and with a grown map it takes three times that, and
+/// then some five of them still fit between two keyframes of a walking camera.
+const STEP: Duration = Duration::from_millis(15);
 /// One Gaussian in view per this many pixels, as seeding gives them.
 const PIXELS_EACH: u32 = 8;
 /// Neither side is made smaller than this.
