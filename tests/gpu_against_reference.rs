@@ -191,7 +191,7 @@ fn adam_steps_agree() {
             let decay = (f64::from(adam.beta_1), f64::from(adam.beta_2), f64::from(adam.epsilon));
             states[i].step(&mut expected[i], &gradient.flat(), &rates, decay);
         }
-        let view = TrainingView { camera, target: &image, scored: None, pace: 1.0, skip: None };
+        let view = TrainingView::new(camera, &image);
         optimiser.steps(&mut rasterizer, &on_gpu, &[view], (&loss, &adam)).unwrap();
     }
     let moved = on_gpu.download(&gpu).unwrap();
@@ -283,7 +283,7 @@ fn pairs_that_outgrow_their_buffers_are_never_dropped() {
     let (image, wide) = target(&mut rng, camera.pinhole);
     let image = upload_target(&gpu, &image, &wide);
     let mut rasterizer = Rasterizer::new(gpu.clone()).unwrap();
-    let views = [TrainingView { camera, target: &image, scored: None, pace: 1.0, skip: None }; 3];
+    let views = [TrainingView::new(camera, &image); 3];
     let configs = (&LossConfig::default(), &AdamConfig::default());
     let reports = Optimiser::new(&rasterizer).unwrap().steps(&mut rasterizer, &on_gpu, &views, configs).unwrap();
     assert!(reports.iter().all(|r| r.counts.pairs > 131_072 && r.loss.l1 > 0.0), "{reports:?}");

@@ -49,7 +49,7 @@ fn scores_are_those_of_their_definition() {
         let mut on_gpu = GpuCloud::new(&gpu, cloud.sh_degree, cloud.len()).unwrap();
         on_gpu.append(&gpu, &cloud).unwrap();
         let target = TargetImage::new(&gpu, &image, None).unwrap();
-        let view = TrainingView { camera, target: &target, scored: Some(wrong_config), pace: 1.0, skip: None };
+        let view = TrainingView { scored: Some(wrong_config), ..TrainingView::new(camera, &target) };
         optimiser.begin_scores(&gpu, &on_gpu).unwrap();
         // Nothing moves, so that both views score the same map.
         let still = AdamConfig::default().scaled(0.0, 0.0);

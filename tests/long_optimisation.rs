@@ -48,7 +48,7 @@ fn two_hundred_steps_on_noise_end_finite() {
             (0..48 * 32).map(|_| if rng.f32() < 0.2 { 0.0 } else { common::between(&mut rng, 0.05, 60.0) }).collect();
         let target = TargetImage::new(&gpu, &image, Some(&depth)).unwrap();
         let skip = (seed % 2 == 1).then_some(TileSkip { share: 0.5, least: 0.1, noise: 0.0 });
-        let view = TrainingView { camera, target: &target, scored: None, pace: 1.0, skip };
+        let view = TrainingView { skip, ..TrainingView::new(camera, &target) };
         let mut losses = Vec::new();
         for _ in 0..STEPS / BATCH {
             let reports = optimiser.steps(&mut rasterizer, &on_gpu, &[view; BATCH], (&LossConfig::default(), &adam)).unwrap();

@@ -3,7 +3,7 @@
 use image::{Rgb, RgbImage};
 use keysplat::geometry::{Pinhole, Se3};
 use keysplat::gpu::Gpu;
-use keysplat::mapping::{DensityConfig, DensityStrategy, Keyframe, Mapper, MappingConfig};
+use keysplat::mapping::{DensityConfig, DensityStrategy, DepthSource, Keyframe, Mapper, MappingConfig};
 use keysplat::render::Rendered;
 use keysplat::sequence::{DepthImage, RectifiedImage};
 use keysplat::splat::{GaussianCloud, ViewCamera};
@@ -16,7 +16,7 @@ fn keyframe(id: usize, world_from_camera: Se3) -> Keyframe {
     let color = RgbImage::from_fn(width, height, |x, y| Rgb([(x * 4) as u8, (y * 5) as u8, ((x / 6 + y / 6) % 2 * 200) as u8]));
     let metres = (0..width * height).map(|i| 2.0 + 0.01 * (i % width) as f32).collect();
     let image = RectifiedImage { pinhole: PINHOLE, color, depth: Some(DepthImage { width, height, metres }) };
-    Keyframe { id, world_from_camera, image, covisible: Vec::new() }
+    Keyframe { id, world_from_camera, image, depth_source: DepthSource::Sensor, covisible: Vec::new() }
 }
 
 fn view(mapper: &mut Mapper, world_from_camera: &Se3) -> Rendered {

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use image::{Rgb, RgbImage};
 use keysplat::geometry::{Pinhole, Se3, se3};
 use keysplat::gpu::Gpu;
-use keysplat::mapping::{Keyframe, Mapper, MappingConfig, RefinePosesConfig, RefinedPair};
+use keysplat::mapping::{DepthSource, Keyframe, Mapper, MappingConfig, RefinePosesConfig, RefinedPair};
 use keysplat::sequence::{DepthImage, RectifiedImage};
 use keysplat::splat::GaussianCloud;
 use nalgebra::{Point3, Vector3, Vector6};
@@ -57,7 +57,9 @@ fn refined(gpu: &Arc<Gpu>, refine_poses: RefinePosesConfig) -> (Vec<RefinedPair>
     let mut mapper = Mapper::new(gpu.clone(), &config).unwrap();
     for id in 0..KEYFRAMES {
         let covisible = (0..id).rev().collect();
-        mapper.insert(&Keyframe { id, world_from_camera: tracked(id), image: image(&truth(id)), covisible }, &|| false).unwrap();
+        let (world_from_camera, image) = (tracked(id), image(&truth(id)));
+        let keyframe = Keyframe { id, world_from_camera, image, depth_source: DepthSource::Sensor, covisible };
+        mapper.insert(&keyframe, &|| false).unwrap();
     }
     let (pairs, map) = (mapper.refined(), mapper.download().unwrap());
     // The tracker moves all that it knows, as after a loop: refinements go along, and so do the Gaussians.

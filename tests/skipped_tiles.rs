@@ -38,7 +38,7 @@ impl Steps<'_> {
         let mut reports = Vec::new();
         for (i, skip) in skips.iter().enumerate() {
             let pace = if i == 0 { 0.0 } else { 1.0 };
-            let view = TrainingView { camera: self.camera, target: &target, scored: None, pace, skip: *skip };
+            let view = TrainingView { pace, skip: *skip, ..TrainingView::new(self.camera, &target) };
             reports.extend(optimiser.steps(&mut rasterizer, &on_gpu, &[view], (&LOSS, &AdamConfig::default())).unwrap());
         }
         (on_gpu.download(&self.gpu).unwrap(), reports)

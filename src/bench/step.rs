@@ -100,7 +100,7 @@ impl StepRunner {
 
     fn steps(&mut self, count: usize) -> Result<(), GpuError> {
         let (camera, target, skip) = (self.scene.camera, &self.scene.target, self.skip);
-        let views = [TrainingView { camera, target, scored: None, pace: 1.0, skip }; BATCH];
+        let views = [TrainingView { skip, ..TrainingView::new(camera, target) }; BATCH];
         let configs = (&LossConfig::default(), &self.still);
         self.optimiser.steps(&mut self.rasterizer, &self.scene.cloud, &views[..count], configs)?;
         Ok(())

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{DensityConfig, LimitsConfig, RefinePosesConfig};
+use super::{DensityConfig, LimitsConfig, PlaneSweepConfig, RefinePosesConfig};
 use crate::optimise::{AdamConfig, LossConfig, TileSkip};
 use crate::splat::ShDegree;
 
@@ -25,6 +25,7 @@ pub struct MappingConfig {
     pub limits: LimitsConfig,
     pub refine_poses: RefinePosesConfig,
     pub seeding: SeedingConfig,
+    pub plane_sweep: PlaneSweepConfig,
     pub points: PointsConfig,
     pub refine: RefineConfig,
     pub density: DensityConfig,
@@ -45,6 +46,7 @@ impl Default for MappingConfig {
             limits: LimitsConfig::default(),
             refine_poses: RefinePosesConfig::default(),
             seeding: SeedingConfig::default(),
+            plane_sweep: PlaneSweepConfig::default(),
             points: PointsConfig::default(),
             refine: RefineConfig::default(),
             density: DensityConfig::default(),
@@ -92,6 +94,11 @@ pub struct SkipConfig {
     pub tile_least: f32,
     /// Loss per pixel below which a tile is worked on no more often than that.
     pub tile_noise: f32,
+    /// A Gaussian rests where the wrong pixels that it is blended into (see [`DensityConfig::wrong_pixels`]) are less than this share of what
+    /// it adds to the scored views, and wakes when they are twice as many; 0: none rests.
+    pub right_share: f32,
+    /// Scored views that a Gaussian must have been in before it may rest.
+    pub right_views: u32,
 }
 
 impl SkipConfig {
@@ -104,7 +111,16 @@ impl SkipConfig {
 
 impl Default for SkipConfig {
     fn default() -> Self {
-        Self { draw_by_loss: true, coarse_share: 0.0, min_gain: 0.01, tile_share: 0.5, tile_least: 0.1, tile_noise: 0.0 }
+        Self {
+            draw_by_loss: true,
+            coarse_share: 0.0,
+            min_gain: 0.01,
+            tile_share: 0.5,
+            tile_least: 0.1,
+            tile_noise: 0.0,
+            right_share: 0.0,
+            right_views: 8,
+        }
     }
 }
 
@@ -121,6 +137,9 @@ pub struct SeedingConfig {
     pub min_alpha: f32,
     /// A pixel whose measured depth is nearer than the map's by this share of itself shows something that the map lacks.
     pub depth_disagreement: f32,
+    /// A block whose brightness differs from its surroundings by this much more in the image than in the render, or less, misses detail;
+    /// 0 to 1, 1: none does.
+    pub missed_detail: f32,
     /// Standard deviation of a seed in units of its spacing on the surface.
     pub footprint: f32,
     /// Standard deviation of a seed across its surface in units of that along it.
@@ -140,6 +159,7 @@ impl Default for SeedingConfig {
             detail: 0.05,
             min_alpha: 0.6,
             depth_disagreement: 0.06,
+            missed_detail: 1.0,
             footprint: 0.55,
             thickness: 1.0,
             opacity: 0.7,
@@ -279,6 +299,7 @@ impl MappingConfig {
         if self.points.size_range < 1.0 {
             return Err(format!("mapping.points.size_range must be at least 1, not {}", self.points.size_range));
         }
+        self.plane_sweep.validate().map_err(|e| format!("mapping.plane_sweep: {e}"))?;
         self.refine_poses.validate().map_err(|e| format!("mapping.refine_poses: {e}"))?;
         self.density.validate().map_err(|e| format!("mapping.density: {e}"))?;
         self.loss.validate().map_err(|e| format!("mapping.loss: {e}"))?;

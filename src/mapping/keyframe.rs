@@ -1,11 +1,12 @@
 //! A keyframe as the mapper receives and keeps it.
 
-use image::{Rgb, RgbImage};
+use image::{GrayImage, Rgb, RgbImage};
 
+use super::plane_sweep::{self, SourceView};
 use super::refine_poses::{RefinePosesConfig, Refinement, median_depth};
 use crate::geometry::{Pinhole, Se3};
 use crate::gpu::{Gpu, GpuError};
-use crate::optimise::{TargetImage, TileSkip, TrainingView, WrongPixels};
+use crate::optimise::{TargetImage, TrainingView};
 use crate::sequence::{DepthImage, RectifiedImage};
 use crate::splat::ViewCamera;
 
@@ -18,8 +19,26 @@ pub struct Keyframe {
     pub id: KeyframeId,
     pub world_from_camera: Se3,
     pub image: RectifiedImage,
+    pub depth_source: DepthSource,
     /// Earlier keyframes that see the same landmarks, strongest first.
     pub covisible: Vec<KeyframeId>,
+}
+
+/// Where a keyframe's depth comes from.
+#[derive(Clone, Debug, Default)]
+pub enum DepthSource {
+    #[default]
+    Sensor,
+    /// It is that of landmarks: sparse.
+    Landmarks { right: Option<RightImage> },
+}
+
+/// The other image of a stereo pair, at the mapping resolution.
+#[derive(Clone, Debug)]
+pub struct RightImage {
+    pub gray: GrayImage,
+    /// From the left camera along its x axis.
+    pub baseline_metres: f64,
 }
 
 /// What is kept: the image only where the optimiser needs it.
@@ -35,6 +54,8 @@ pub(super) struct MappedKeyframe {
     pub depth_metres: f64,
     /// Until it is given back.
     image: Option<Images>,
+    /// On the host, where depth is swept for.
+    gray: Option<GrayImage>,
     pub covisible: Vec<KeyframeId>,
     /// At its last step; 1 before.
     pub loss: f32,
@@ -64,6 +85,7 @@ impl MappedKeyframe {
             refinement: Refinement::default(),
             depth_metres: median_depth(image),
             image: Some(Images { whole: target(image)?, half: worth.then(|| target(&halved(image))).transpose()? }),
+            gray: matches!(keyframe.depth_source, DepthSource::Landmarks { .. }).then(|| plane_sweep::gray(&image.color)),
             covisible: keyframe.covisible.clone(),
             loss: 1.0,
         })
@@ -89,6 +111,12 @@ impl MappedKeyframe {
     /// Gives the image back; the pose stays, for Gaussians move with it.
     pub fn forget_image(&mut self) {
         self.image = None;
+        self.gray = None;
+    }
+
+    /// What depth is swept for with.
+    pub fn source(&self) -> Option<SourceView<'_>> {
+        self.gray.as_ref().map(|gray| SourceView { camera: self.camera, gray })
     }
 
     /// Bytes of its image on the GPU.
@@ -98,18 +126,13 @@ impl MappedKeyframe {
     }
 
     /// What a step learns from; coarse where that is wished and there is a smaller image. `None` without an image.
-    pub fn view(
-        &self,
-        coarse: bool,
-        pace: f32,
-        (scored, skip): (Option<WrongPixels>, Option<TileSkip>),
-    ) -> Option<TrainingView<'_>> {
+    pub fn view(&self, coarse: bool) -> Option<TrainingView<'_>> {
         let image = self.image.as_ref()?;
         Some(match image.half.as_ref().filter(|_| coarse) {
-            None => TrainingView { camera: self.camera, target: &image.whole, scored, pace, skip },
+            None => TrainingView::new(self.camera, &image.whole),
             Some(target) => {
                 let pinhole = halved_pinhole(&self.camera.pinhole);
-                TrainingView { camera: ViewCamera { pinhole, ..self.camera }, target, scored, pace, skip }
+                TrainingView::new(ViewCamera { pinhole, ..self.camera }, target)
             }
         })
     }

@@ -13,8 +13,9 @@ use serde::{Deserialize, Serialize};
 pub use refine::{RefineReport, Refinement};
 
 use super::density::{self, Candidate};
-use super::keyframe::MappedKeyframe;
+use super::keyframe::{DepthSource, MappedKeyframe};
 use super::ledger::{self, Ledger};
+use super::plane_sweep::{self, SourceView};
 use super::refine_poses::{self, RefinedPair};
 use super::schedule::{self, Session, Step};
 use super::{DensityStrategy, Keyframe, KeyframeId, LimitsConfig, MappingConfig, limits, points, seeding};
@@ -22,7 +23,7 @@ use crate::geometry::Se3;
 use crate::gpu::{Gpu, GpuError};
 use crate::optimise::{GaussianScore, Optimiser, StepReport, TrainingView, WrongPixels};
 use crate::render::{GpuCloud, Rasterizer, Rendered};
-use crate::sequence::KnownPoint;
+use crate::sequence::{KnownPoint, RectifiedImage};
 use crate::splat::GaussianCloud;
 use crate::splat::ViewCamera;
 
@@ -89,6 +90,8 @@ impl Mapper {
         if keyframe.image.depth.is_none() && self.keyframes.is_empty() && self.cloud.is_empty() {
             return Err(MappingError::NoDepth { id: keyframe.id });
         }
+        let swept = self.sweep(keyframe);
+        let keyframe = swept.as_ref().unwrap_or(keyframe);
         let mapped = MappedKeyframe::new(&self.gpu, keyframe, self.config.learns_at_half_size())?;
         let seeded = self.seed(keyframe, &mapped.camera)?;
         self.keyframes.push(mapped);
@@ -155,6 +158,32 @@ impl Mapper {
         self.cloud.len()
     }
 
+    /// The keyframe with more depth than that of its landmarks, if that is what it has and more can be found.
+    fn sweep(&self, keyframe: &Keyframe) -> Option<Keyframe> {
+        let DepthSource::Landmarks { right } = &keyframe.depth_source else { return None };
+        let (image, config) = (&keyframe.image, &self.config.plane_sweep);
+        let landmarks = image.depth.as_ref().filter(|_| config.enabled)?;
+        let camera = ViewCamera { pinhole: image.pinhole, camera_from_world: keyframe.world_from_camera.inverse() };
+        let beside = right.as_ref().map(|right| {
+            let right_from_left = Se3::translation(-right.baseline_metres, 0.0, 0.0);
+            let camera = ViewCamera { camera_from_world: right_from_left * camera.camera_from_world, ..camera };
+            SourceView { camera, gray: &right.gray }
+        });
+        let earlier =
+            |id: &KeyframeId| self.keyframes.binary_search_by_key(id, |k| k.id).ok().and_then(|k| self.keyframes[k].source());
+        let others: Vec<SourceView<'_>> = beside.into_iter().chain(keyframe.covisible.iter().filter_map(earlier)).collect();
+        let gray = plane_sweep::gray(&image.color);
+        let mut depth = plane_sweep::estimate(&SourceView { camera, gray: &gray }, landmarks, &others, config)?;
+        depth
+            .metres
+            .iter_mut()
+            .zip(&landmarks.metres)
+            .filter(|(_, metres)| **metres > 0.0)
+            .for_each(|(to, metres)| *to = *metres);
+        let image = RectifiedImage { depth: Some(depth), ..image.clone() };
+        Some(Keyframe { image, ..keyframe.clone() })
+    }
+
     fn seed(&mut self, keyframe: &Keyframe, camera: &ViewCamera) -> Result<usize, MappingError> {
         if keyframe.image.depth.is_none() {
             return Ok(0);
@@ -207,7 +236,7 @@ impl Mapper {
             Some(_) => self.optimiser.read_scores(&self.gpu, &self.cloud)?,
             None => vec![GaussianScore::default(); self.cloud.len()],
         };
-        self.ledger.keyframe_mapped(&scores);
+        self.ledger.keyframe_mapped(&scores, &self.config.skip);
         let [geometry, scales, rotations] = [0, 1, 2].map(|plane| self.cloud.read_plane(&self.gpu, plane));
         let (geometry, scales, rotations) = (geometry?, scales?, rotations?);
         let candidate = |i: usize| {
@@ -223,6 +252,10 @@ impl Mapper {
         let geometry: Vec<[[f32; 4]; 2]> = plan.children.iter().map(geometry).collect();
         self.cloud.change(&self.gpu, &plan.keep, (&parents, &geometry))?;
         self.ledger.apply(&plan.keep, parents.into_iter());
+        if self.config.skip.right_share > 0.0 {
+            let resting: Vec<bool> = self.ledger.entries().iter().map(|entry| entry.rests).collect();
+            self.cloud.mark_resting(&self.gpu, &resting)?;
+        }
         // Two children take their parent's place.
         Ok((before - plan.keep.len() - children / 2, children / 2))
     }
@@ -275,12 +308,13 @@ impl Mapper {
     }
 
     fn steps(&mut self, batch: &[Step], scored: Option<WrongPixels>) -> Result<Vec<StepReport>, MappingError> {
-        // A pose is refined by its whole image.
-        let skip = self.config.skip.tiles().filter(|_| !self.config.refine_poses.enabled);
+        // A pose is refined by its whole image and all that it shows.
+        let whole = self.config.refine_poses.enabled;
+        let skip = self.config.skip.tiles().filter(|_| !whole);
+        let rests = self.config.skip.right_share > 0.0 && !whole && scored.is_none();
         let view = |step: &Step| {
-            self.keyframes[step.keyframe]
-                .view(step.coarse, step.pace, (scored, skip))
-                .expect("only keyframes with images are drawn")
+            let view = self.keyframes[step.keyframe].view(step.coarse).expect("only keyframes with images are drawn");
+            TrainingView { pace: step.pace, scored, skip, rests, ..view }
         };
         let views: Vec<TrainingView<'_>> = batch.iter().map(view).collect();
         let started = Instant::now();

@@ -8,6 +8,7 @@ mod ledger;
 mod limits;
 mod mapper;
 mod neighbours;
+mod plane_sweep;
 mod points;
 mod refine_poses;
 mod schedule;
@@ -15,7 +16,8 @@ mod seeding;
 
 pub use config::{MappingConfig, PointsConfig, RefineConfig, SeedingConfig, SkipConfig, WindowConfig};
 pub use density::{ClassicConfig, DensityConfig, DensityStrategy, VcdConfig};
-pub use keyframe::{Keyframe, KeyframeId};
+pub use keyframe::{DepthSource, Keyframe, KeyframeId, RightImage};
 pub use limits::LimitsConfig;
 pub use mapper::{KeyframeReport, Mapper, MappingError, RefineReport, Refinement};
+pub use plane_sweep::PlaneSweepConfig;
 pub use refine_poses::{RefinePosesConfig, RefinedPair};

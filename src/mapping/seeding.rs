@@ -1,5 +1,5 @@
-//! New Gaussians from a keyframe: where the render lacks alpha or lies behind the measured surface, one per block of pixels: a quadtree
-//! of blocks, small where the colours vary and large where they don't, each seed the size of its block on the surface.
+//! New Gaussians from a keyframe: where the render lacks alpha, lies behind the measured surface or misses detail, one per block of pixels:
+//! a quadtree of blocks, small where the colours vary and large where they don't, each seed the size of its block on the surface.
 //!
 //! Pixels without depth are seeded too where the map has nothing: their depth is interpolated across the hole, from the farther side
 //! where the sides differ (a structured-light sensor is blind in the shadow beside a near object). Later views correct them.
@@ -32,13 +32,15 @@ pub(super) fn seed(
     let filled = fill_holes(depth);
     let (width, height) = image.color.dimensions();
     let sums = ColorSums::new(&image.color);
+    let missed = rendered.map(|r| Missed::new(&image.color, r));
     for block in sums.blocks(config) {
         let center = ((block.x + block.size / 2).min(width - 1), (block.y + block.size / 2).min(height - 1));
         let metres = filled[(center.1 * width + center.0) as usize];
         let measured = depth.at(center.0, center.1);
         if metres >= config.min_depth_metres
             && metres <= config.max_depth_metres
-            && rendered.is_none_or(|r| lacks(r, (center.1 * width + center.0) as usize, measured, config))
+            && (rendered.is_none_or(|r| lacks(r, (center.1 * width + center.0) as usize, measured, config))
+                || missed.as_ref().is_some_and(|m| m.response(block) > config.missed_detail))
         {
             let slope = slope(&filled, (width, height), center, block.size);
             cloud.push(gaussian(keyframe, center, (metres, slope), block.size, config));
@@ -166,6 +168,40 @@ impl ColorSums {
     }
 }
 
+/// What the render misses: the brightness of image minus render, summed over the pixels above and left of each corner, `[H + 1, W + 1]`.
+struct Missed {
+    width: u32,
+    height: u32,
+    sums: Vec<f64>,
+}
+
+impl Missed {
+    fn new(image: &RgbImage, rendered: &Rendered) -> Self {
+        let (width, height) = image.dimensions();
+        let row = width as usize + 1;
+        let mut sums = vec![0.0; row * (height as usize + 1)];
+        for ((x, y, pixel), render) in image.enumerate_pixels().zip(&rendered.color_depth) {
+            let missed = (0..3).map(|k| f64::from(pixel[k]) / 255.0 - f64::from(render[k])).sum::<f64>() / 3.0;
+            let at = (y as usize + 1) * row + x as usize + 1;
+            sums[at] = missed + sums[at - 1] + sums[at - row] - sums[at - row - 1];
+        }
+        Self { width, height, sums }
+    }
+
+    /// Mean over the part of a rectangle that is on the image, from a corner to another.
+    fn mean(&self, (x0, y0): (u32, u32), (x1, y1): (u32, u32)) -> f64 {
+        let (x1, y1) = (x1.min(self.width), y1.min(self.height));
+        let at = |x: u32, y: u32| self.sums[y as usize * (self.width as usize + 1) + x as usize];
+        (at(x1, y1) + at(x0, y0) - at(x1, y0) - at(x0, y1)) / f64::from((x1 - x0) * (y1 - y0))
+    }
+
+    /// How a block differs from its surroundings in what is missed: the Laplacian of Gaussian at the block's scale, by boxes.
+    fn response(&self, Block { x, y, size }: Block) -> f32 {
+        let around = self.mean((x.saturating_sub(size), y.saturating_sub(size)), (x + 2 * size, y + 2 * size));
+        (self.mean((x, y), (x + size, y + size)) - around).abs() as f32
+    }
+}
+
 /// Depth with its holes interpolated from their four sides, metres; 0 only where a pixel has no measured side at all.
 fn fill_holes(depth: &DepthImage) -> Vec<f32> {
     let (width, height) = (depth.width as usize, depth.height as usize);
@@ -205,6 +241,7 @@ fn interpolate(around: &[(f32, f32); 4]) -> f32 {
 
 #[cfg(test)]
 mod tests {
+    use super::super::DepthSource;
     use super::*;
     use crate::geometry::{Pinhole, Se3};
     use crate::sequence::RectifiedImage;
@@ -214,7 +251,7 @@ mod tests {
         let (width, height) = color.dimensions();
         let pinhole = Pinhole { fx: 30.0, fy: 30.0, cx: 15.5, cy: 11.5, width, height };
         let image = RectifiedImage { pinhole, color, depth: Some(DepthImage { width, height, metres }) };
-        Keyframe { id: 0, world_from_camera: Se3::identity(), image, covisible: vec![] }
+        Keyframe { id: 0, world_from_camera: Se3::identity(), image, depth_source: DepthSource::Sensor, covisible: vec![] }
     }
 
     #[test]

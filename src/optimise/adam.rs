@@ -91,9 +91,10 @@ impl AdamConfig {
         let p = self.position_rate;
         let rates = [
             [p, p, p, self.opacity_rate],
-            [self.scale_rate; 4],
+            // Lanes that hold no parameter stand still.
+            [self.scale_rate, self.scale_rate, self.scale_rate, 0.0],
             [self.rotation_rate; 4],
-            [self.color_rate; 4],
+            [self.color_rate, self.color_rate, self.color_rate, 0.0],
             [self.harmonics_rate; 4],
         ];
         let rates = rates.map(|lanes| lanes.map(|rate| rate * pace));

@@ -16,7 +16,7 @@ use super::{FrameRecord, MapperMessage, PipelineError, Progress};
 use crate::config::Config;
 use crate::evaluation::trajectory::MAX_TIME_DIFFERENCE_S;
 use crate::geometry::{Se3, StampedPose};
-use crate::mapping::{Keyframe, MappingConfig};
+use crate::mapping::{DepthSource, Keyframe, MappingConfig};
 use crate::sequence::{Frame, KnownPoint, Layout, RectifiedImage, Rectifier, Sensor, Sequence};
 use crate::tracking::{KeyframePose, StageTimes};
 
@@ -143,7 +143,7 @@ impl Follower<'_> {
         let pose = KeyframePose { id, frame_index: frame.index, timestamp_s: frame.timestamp_s, world_from_camera };
         let distance = median_depth(&image).unwrap_or(self.scene_distance);
         self.keyframes.push(Known { pose, distance });
-        Keyframe { id, world_from_camera, image, covisible }
+        Keyframe { id, world_from_camera, image, depth_source: DepthSource::Sensor, covisible }
     }
 }
 

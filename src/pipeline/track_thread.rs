@@ -7,8 +7,8 @@ use super::messages::{TrackingProgress, guarded};
 use super::{FrameRecord, MapperMessage, PipelineError, Progress};
 use crate::config::Config;
 use crate::geometry::{StampedPose, Trajectory};
-use crate::mapping::Keyframe;
-use crate::sequence::{Frame, Rectifier, Sequence};
+use crate::mapping::{DepthSource, Keyframe, RightImage};
+use crate::sequence::{Frame, Rectifier, Sensor, Sequence};
 use crate::tracking::{KeyframePose, NewKeyframe, TrackedFrame, Tracker, TrackingState};
 
 /// What tracking came to, also when it ended early.
@@ -101,7 +101,7 @@ pub(super) fn track(
         let (frames_done, keyframes) = (frame.index + 1, tracker.keyframes().len());
         progress.tracking.force_push(TrackingProgress { frames_done, keyframes, lost });
         let keyframe = tracked.keyframe.as_ref().map(|k| k.id);
-        if !sender.retry() || !hand_on(&mut sender, &rectifier, &frame, tracked) {
+        if !sender.retry() || !hand_on(&mut sender, (&rectifier, sequence.sensor), &frame, tracked) {
             break;
         }
         if let Err(error) = tracker.measure(&listener.hear(keyframe)) {
@@ -121,17 +121,34 @@ pub(super) fn track(
     summary
 }
 
-fn hand_on(sender: &mut KeyframeSender<'_>, rectifier: &Rectifier, frame: &Frame, tracked: TrackedFrame) -> bool {
+fn hand_on(
+    sender: &mut KeyframeSender<'_>,
+    (rectifier, sensor): (&Rectifier, Sensor),
+    frame: &Frame,
+    tracked: TrackedFrame,
+) -> bool {
     if !tracked.updates.is_empty() && !sender.send(MapperMessage::PoseUpdate(tracked.updates)) {
         return false;
     }
     let Some(NewKeyframe { id, world_from_camera, seen, covisible }) = tracked.keyframe else { return true };
     let mut image = rectifier.rectify(frame);
+    let mut depth_source = DepthSource::Sensor;
     if image.depth.is_none() && !seen.is_empty() {
         image.depth = Some(rectifier.sparse_depth(&seen));
+        depth_source = DepthSource::Landmarks { right: right_image(rectifier, sensor, frame) };
     }
-    let keyframe = Keyframe { id, world_from_camera, image, covisible: covisible.into_iter().map(|(id, _)| id).collect() };
+    let covisible = covisible.into_iter().map(|(id, _)| id).collect();
+    let keyframe = Keyframe { id, world_from_camera, image, depth_source, covisible };
     sender.send(MapperMessage::Keyframe(Box::new(keyframe)))
+}
+
+fn right_image(rectifier: &Rectifier, sensor: Sensor, frame: &Frame) -> Option<RightImage> {
+    match (sensor, &frame.right) {
+        (Sensor::Stereo { baseline_metres }, Some(right)) => {
+            Some(RightImage { gray: rectifier.rectify_right(right), baseline_metres })
+        }
+        _ => None,
+    }
 }
 
 impl TrackSummary {

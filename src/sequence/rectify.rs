@@ -1,6 +1,6 @@
 //! Frames as the mapper wants them: without lens distortion, at the mapping resolution.
 
-use image::{ImageBuffer, Pixel, Rgb, RgbImage};
+use image::{GrayImage, ImageBuffer, Pixel, Rgb, RgbImage};
 use nalgebra::Vector2;
 
 use super::{DepthImage, Frame};
@@ -63,12 +63,7 @@ impl Rectifier {
         let mut color = RgbImage::new(self.pinhole.width, self.pinhole.height);
         let group = self.samples * self.samples;
         for (pixel, sources) in color.pixels_mut().zip(self.sources.chunks_exact(group)) {
-            let mut sum = [0.0f32; 3];
-            for source in sources {
-                let value: [f32; 3] = bilinear(&frame.color, *source);
-                (0..3).for_each(|c| sum[c] += value[c]);
-            }
-            *pixel = Rgb(sum.map(|v| (v / group as f32 + 0.5) as u8));
+            *pixel = Rgb(box_filter(&frame.color, sources));
         }
         let depth = frame.depth.as_ref().map(|depth| DepthImage {
             width: self.pinhole.width,
@@ -76,6 +71,12 @@ impl Rectifier {
             metres: self.sources.chunks_exact(group).map(|sources| nearest_surface(depth, sources)).collect(),
         });
         RectifiedImage { pinhole: self.pinhole, color, depth }
+    }
+
+    /// The right image of a pair, whose camera is like the left one.
+    pub fn rectify_right(&self, right: &GrayImage) -> GrayImage {
+        let pixels = self.sources.chunks_exact(self.samples * self.samples).map(|sources| box_filter::<_, 1>(right, sources)[0]);
+        GrayImage::from_raw(self.pinhole.width, self.pinhole.height, pixels.collect()).expect("one group a pixel")
     }
 
     /// A depth image of a few points alone: pixels of the recorded camera without its distortion, and metres along z.
@@ -93,6 +94,16 @@ impl Rectifier {
         }
         DepthImage { width, height, metres }
     }
+}
+
+/// Mean of bilinear samples.
+fn box_filter<P: Pixel<Subpixel = u8>, const C: usize>(image: &ImageBuffer<P, Vec<u8>>, sources: &[[f32; 2]]) -> [u8; C] {
+    let mut sum = [0.0f32; C];
+    for source in sources {
+        let value: [f32; C] = bilinear(image, *source);
+        (0..C).for_each(|c| sum[c] += value[c]);
+    }
+    sum.map(|v| (v / sources.len() as f32 + 0.5) as u8)
 }
 
 /// The `C` channels at a position in pixels; beyond the border its values go on.
