@@ -56,10 +56,7 @@ fn backward(rank: u32) -> PoseGradient {
     if rank + 1u < counters[VISIBLE_COUNTER].count {
         end = pair_offsets[rank + 1u];
     }
-    let i = order[rank];
-    let scale_mark = parameters[view.capacity + i];
-    // A Gaussian that rests has no gradient.
-    for (var slot = select(pair_offsets[rank], end, is_resting(view, scale_mark.w)); slot < end; slot++) {
+    for (var slot = pair_offsets[rank]; slot < end; slot++) {
         color_depth += pair_gradients[slot * 3u];
         first += pair_gradients[slot * 3u + 1u];
         second += pair_gradients[slot * 3u + 2u];
@@ -68,8 +65,9 @@ fn backward(rank: u32) -> PoseGradient {
     if untouched {
         return PoseGradient(vec3(0.0), vec3(0.0));
     }
+    let i = order[rank];
     let mean_opacity = parameters[i];
-    let log_scale = scale_mark.xyz;
+    let log_scale = parameters[view.capacity + i].xyz;
     let rotation = parameters[2u * view.capacity + i];
     let inverse_norm = inverseSqrt(dot(rotation, rotation));
     let unit_rotation = rotation * inverse_norm;

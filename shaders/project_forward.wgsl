@@ -5,7 +5,7 @@
 // [planes, capacity], see `render::GpuCloud`.
 @group(0) @binding(1) var<storage, read> parameters: array<vec4<f32>>;
 // [3, capacity]: (mean x, mean y, depth, cut), (whitening xx, xy, yy, opacity),
-// (r, g, b, half extents of the ellipse in pixels as two f16, the second negative where the Gaussian rests).
+// (r, g, b, half extents of the ellipse in pixels as two f16).
 @group(0) @binding(2) var<storage, read_write> projected: array<vec4<f32>>;
 // [N] 1 where the Gaussian may touch the image.
 @group(0) @binding(3) var<storage, read_write> visible: array<u32>;
@@ -42,8 +42,8 @@ fn project(i: u32) -> bool {
     if !(norm_squared >= MIN_QUATERNION_NORM_SQUARED) {
         return false;
     }
-    let log_scale = parameters[view.capacity + i];
-    let projection = project_gaussian(view, mean_opacity.xyz, log_scale.xyz, rotation * inverseSqrt(norm_squared));
+    let log_scale = parameters[view.capacity + i].xyz;
+    let projection = project_gaussian(view, mean_opacity.xyz, log_scale, rotation * inverseSqrt(norm_squared));
     let c = projection.covariance;
     if !(projection.determinant >= MIN_DETERMINANT && projection.determinant < MAX_DETERMINANT) {
         return false;
@@ -63,9 +63,7 @@ fn project(i: u32) -> bool {
     }
     projected[i] = vec4(mean, depth, cut);
     projected[view.capacity + i] = vec4(whitening(projection), opacity);
-    let sign = vec2(1.0, select(1.0, -1.0, is_resting(view, log_scale.w)));
-    let extents = pack2x16float(sign * min(half_extent * EXTENT_SLACK, vec2(MAX_EXTENT)));
-    projected[2u * view.capacity + i] = vec4(seen, bitcast<f32>(extents));
+    projected[2u * view.capacity + i] = vec4(seen, bitcast<f32>(pack2x16float(min(half_extent * EXTENT_SLACK, vec2(MAX_EXTENT)))));
     return true;
 }
 

@@ -40,14 +40,7 @@ fn main(
                 let shape = batch_whitening[chunk + k];
                 let color = batch_color[chunk + k];
                 var sum = PairGradient(vec4(0.0), vec4(0.0), vec4(0.0));
-                // A loop without a turn costs nothing, while both sides of a branch are run here.
-                let rests = bitcast<i32>(color.w) < 0;
-                for (var q = select(QUADS, 0u, rests); q < QUADS; q++) {
-                    var quad = pixels[q];
-                    pass_resting(mean, shape, color, start + chunk + k - range.x, quads[q], &quad);
-                    pixels[q] = quad;
-                }
-                for (var q = select(0u, QUADS, rests); q < QUADS; q++) {
+                for (var q = 0u; q < QUADS; q++) {
                     var quad = pixels[q];
                     pass_gaussian(mean, shape, color, start + chunk + k - range.x, quads[q], &quad, &sum);
                     pixels[q] = quad;

@@ -41,7 +41,7 @@ fn main(
     let whitening = projected[view.capacity + gaussian].xyz;
     let limit = mean_cut.w * (1.0 + SLACK) + SLACK;
     let mean = mean_cut.xy;
-    let half_extent = abs(unpack2x16float(bitcast<u32>(projected[2u * view.capacity + gaussian].w)));
+    let half_extent = unpack2x16float(bitcast<u32>(projected[2u * view.capacity + gaussian].w));
     let last_tile = vec2<f32>(f32(view.tiles_x), f32(view.tiles_y)) - 1.0;
     let tile_size = vec2(f32(TILE_WIDTH), f32(TILE_HEIGHT));
     // Pixel centres are integers, so a tile's pixels span [first, first + size - 1].

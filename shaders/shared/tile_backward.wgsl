@@ -94,16 +94,6 @@ fn pass_gaussian(
     (*sum).second += vec4(dot(qx, dx), dot(qx, dy), dot(qy, dy), 0.0);
 }
 
-// Takes a quad past a Gaussian that rests: without its gradient.
-fn pass_resting(mean: vec4<f32>, shape: vec4<f32>, color: vec4<f32>, position: u32, quad: Quad, pixels: ptr<function, PixelState>) {
-    let distance = half_distance(mean.xy, shape.xyz, quad);
-    let hit = (distance <= vec4(mean.w)) & (vec4(position) < (*pixels).last);
-    let alpha = select(vec4(0.0), min(vec4(ALPHA_MAX), shape.w * exp(-distance)), hit);
-    let value = (*pixels).red * color.x + (*pixels).green * color.y + (*pixels).blue * color.z + (*pixels).depth * mean.z;
-    (*pixels).behind -= alpha * (*pixels).transmittance * value;
-    (*pixels).transmittance *= 1.0 - alpha;
-}
-
 // Pairs behind every pixel's last contributor were not blended.
 fn clear_unblended(first: u32, end: u32, local: u32) {
     for (var i = first + local; i < end; i += TILE_THREADS) {

@@ -10,7 +10,7 @@ struct View {
     intrinsics: vec4<f32>,
     // Bounds on x/z and y/z inside the Jacobian: min x, max x, min y, max y.
     tangent_bounds: vec4<f32>,
-    // Colour behind the map, RGB; w is 1 where Gaussians that rest take no part in the backward pass, else 0.
+    // Colour behind the map, RGB; w unused.
     background: vec4<f32>,
     // Image and tile grid sizes.
     width: u32,
@@ -27,11 +27,6 @@ struct View {
 // Workgroups beyond 65,535 are laid out in two dimensions.
 fn linear_workgroup(workgroup: vec3<u32>, workgroups: vec3<u32>) -> u32 {
     return workgroup.y * workgroups.x + workgroup.x;
-}
-
-// Whether a Gaussian, of this mark beside its log scale, takes no part in the backward pass.
-fn is_resting(view_: View, mark: f32) -> bool {
-    return mark * view_.background.w > 0.5;
 }
 
 fn rotate_to_camera(view_: View, v: vec3<f32>) -> vec3<f32> {

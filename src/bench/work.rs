@@ -40,7 +40,7 @@ pub fn count_work(rasterizer: &mut Rasterizer, cloud: &GpuCloud, camera: &ViewCa
     let (width, height) = (rendered.width, rendered.height);
     let tiles_x = width.div_ceil(TILE_WIDTH);
     let tiles = tiles_x * height.div_ceil(TILE_HEIGHT);
-    let sorted = rasterizer.prepare(cloud, camera, [0.0; 3], false)?.sorted;
+    let sorted = rasterizer.prepare(cloud, camera, [0.0; 3])?.sorted;
     let ws = &rasterizer.workspace;
     let ranges: Vec<[u32; 2]> = ws.ranges.read(&gpu, 0, tiles as usize)?;
     let slots: Vec<u32> = ws.slots[sorted].read(&gpu, 0, counts.pairs as usize)?;

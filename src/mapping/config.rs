@@ -94,11 +94,6 @@ pub struct SkipConfig {
     pub tile_least: f32,
     /// Loss per pixel below which a tile is worked on no more often than that.
     pub tile_noise: f32,
-    /// A Gaussian rests where the wrong pixels that it is blended into (see [`DensityConfig::wrong_pixels`]) are less than this share of what
-    /// it adds to the scored views, and wakes when they are twice as many; 0: none rests.
-    pub right_share: f32,
-    /// Scored views that a Gaussian must have been in before it may rest.
-    pub right_views: u32,
 }
 
 impl SkipConfig {
@@ -111,16 +106,7 @@ impl SkipConfig {
 
 impl Default for SkipConfig {
     fn default() -> Self {
-        Self {
-            draw_by_loss: true,
-            coarse_share: 0.0,
-            min_gain: 0.01,
-            tile_share: 0.5,
-            tile_least: 0.1,
-            tile_noise: 0.0,
-            right_share: 0.0,
-            right_views: 8,
-        }
+        Self { draw_by_loss: true, coarse_share: 0.0, min_gain: 0.01, tile_share: 0.5, tile_least: 0.1, tile_noise: 0.0 }
     }
 }
 
@@ -159,7 +145,7 @@ impl Default for SeedingConfig {
             detail: 0.05,
             min_alpha: 0.6,
             depth_disagreement: 0.06,
-            missed_detail: 1.0,
+            missed_detail: 0.06,
             footprint: 0.55,
             thickness: 1.0,
             opacity: 0.7,

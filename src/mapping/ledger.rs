@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 use std::ops::Range;
 
-use super::{KeyframeId, SkipConfig};
+use super::KeyframeId;
 use crate::geometry::Se3;
 use crate::optimise::GaussianScore;
 
@@ -25,8 +25,6 @@ pub(super) struct Entry {
     pub best_weight: f32,
     /// The most that it added to one view, pixels.
     pub worth: f32,
-    /// It is right in all views of late: see [`SkipConfig`].
-    pub rests: bool,
 }
 
 /// The entries, `[N]` in map order. Seeds are appended and pruning keeps the order, so most of a keyframe's Gaussians lie side by side.
@@ -49,16 +47,12 @@ impl Ledger {
     }
 
     /// Another keyframe was mapped; `scores` are those of its scored views, if there were any.
-    pub fn keyframe_mapped(&mut self, scores: &[GaussianScore], skip: &SkipConfig) {
+    pub fn keyframe_mapped(&mut self, scores: &[GaussianScore]) {
         self.entries.iter_mut().for_each(|entry| entry.age += 1);
         for (entry, score) in self.entries.iter_mut().zip(scores) {
             entry.views += score.views as u32;
             entry.best_weight = entry.best_weight.max(score.weight_max);
             entry.worth = entry.worth.max(score.weight_sum / score.views.max(1.0));
-            if score.views > 0.0 {
-                let limit = if entry.rests { 2.0 * skip.right_share } else { skip.right_share };
-                entry.rests = entry.views >= skip.right_views && score.wrong_pixels < limit * score.weight_sum;
-            }
         }
     }
 
@@ -101,24 +95,6 @@ mod tests {
         let motions = BTreeMap::from([(2, shift), (5, shift), (7, shift)]);
         assert_eq!(ledger.moved(&motions), [(2..4, shift), (4..5, shift), (6..8, shift)]);
         assert!(ledger.moved(&BTreeMap::new()).is_empty());
-    }
-
-    #[test]
-    fn a_gaussian_that_is_right_in_many_views_rests_until_its_error_returns() {
-        let skip = SkipConfig { right_share: 0.2, right_views: 8, ..SkipConfig::default() };
-        let mut ledger = Ledger::default();
-        ledger.append(0, 1);
-        let mut after = |wrong_pixels: f32, views: f32| {
-            ledger.keyframe_mapped(&[GaussianScore { wrong_pixels, weight_sum: 10.0, views, ..GaussianScore::default() }], &skip);
-            ledger.entries()[0].rests
-        };
-        assert!(!after(0.0, 4.0), "too few views have seen it");
-        assert!(after(0.0, 4.0));
-        assert!(after(0.0, 0.0), "a view that does not show it says nothing");
-        assert!(after(3.0, 4.0));
-        assert!(!after(4.0, 4.0));
-        assert!(!after(3.0, 4.0), "it falls asleep later than it wakes");
-        assert!(after(1.0, 4.0));
     }
 
     #[test]

@@ -236,7 +236,7 @@ impl Mapper {
             Some(_) => self.optimiser.read_scores(&self.gpu, &self.cloud)?,
             None => vec![GaussianScore::default(); self.cloud.len()],
         };
-        self.ledger.keyframe_mapped(&scores, &self.config.skip);
+        self.ledger.keyframe_mapped(&scores);
         let [geometry, scales, rotations] = [0, 1, 2].map(|plane| self.cloud.read_plane(&self.gpu, plane));
         let (geometry, scales, rotations) = (geometry?, scales?, rotations?);
         let candidate = |i: usize| {
@@ -252,10 +252,6 @@ impl Mapper {
         let geometry: Vec<[[f32; 4]; 2]> = plan.children.iter().map(geometry).collect();
         self.cloud.change(&self.gpu, &plan.keep, (&parents, &geometry))?;
         self.ledger.apply(&plan.keep, parents.into_iter());
-        if self.config.skip.right_share > 0.0 {
-            let resting: Vec<bool> = self.ledger.entries().iter().map(|entry| entry.rests).collect();
-            self.cloud.mark_resting(&self.gpu, &resting)?;
-        }
         // Two children take their parent's place.
         Ok((before - plan.keep.len() - children / 2, children / 2))
     }
@@ -308,13 +304,11 @@ impl Mapper {
     }
 
     fn steps(&mut self, batch: &[Step], scored: Option<WrongPixels>) -> Result<Vec<StepReport>, MappingError> {
-        // A pose is refined by its whole image and all that it shows.
-        let whole = self.config.refine_poses.enabled;
-        let skip = self.config.skip.tiles().filter(|_| !whole);
-        let rests = self.config.skip.right_share > 0.0 && !whole && scored.is_none();
+        // A pose is refined by its whole image.
+        let skip = self.config.skip.tiles().filter(|_| !self.config.refine_poses.enabled);
         let view = |step: &Step| {
             let view = self.keyframes[step.keyframe].view(step.coarse).expect("only keyframes with images are drawn");
-            TrainingView { pace: step.pace, scored, skip, rests, ..view }
+            TrainingView { pace: step.pace, scored, skip, ..view }
         };
         let views: Vec<TrainingView<'_>> = batch.iter().map(view).collect();
         let started = Instant::now();

@@ -34,14 +34,12 @@ pub struct TrainingView<'a> {
     pub pace: f32,
     /// Which tiles are left out; a scored step leaves none.
     pub skip: Option<TileSkip>,
-    /// Whether Gaussians that are marked to rest do so.
-    pub rests: bool,
 }
 
 impl<'a> TrainingView<'a> {
     /// The whole view, for all Gaussians, at full pace.
     pub fn new(camera: ViewCamera, target: &'a TargetImage) -> Self {
-        Self { camera, target, scored: None, pace: 1.0, skip: None, rests: false }
+        Self { camera, target, scored: None, pace: 1.0, skip: None }
     }
 }
 
@@ -67,13 +65,7 @@ pub struct Gradients {
 /// Where the backward pass starts from.
 enum Objective<'a> {
     /// With the Gaussians' scores on the way, if asked for, and the tiles to leave out with the seed of the draw.
-    Image {
-        target: &'a TargetImage,
-        loss: &'a LossConfig,
-        scored: Option<&'a WrongPixels>,
-        skip: Option<(TileSkip, u32)>,
-        rests: bool,
-    },
+    Image { target: &'a TargetImage, loss: &'a LossConfig, scored: Option<&'a WrongPixels>, skip: Option<(TileSkip, u32)> },
     /// Gradients by the image are in the buffer already.
     Given,
 }
@@ -145,9 +137,9 @@ impl Optimiser {
         let mut pending: Vec<usize> = (0..views.len()).collect();
         while !pending.is_empty() {
             for (entry, &i) in pending.iter().enumerate() {
-                let TrainingView { camera, target, scored, pace, skip, rests } = &views[i];
+                let TrainingView { camera, target, scored, pace, skip } = &views[i];
                 let skip = skip.filter(|_| scored.is_none()).map(|skip| (skip, self.steps as u32));
-                let objective = Objective::Image { target, loss, scored: scored.as_ref(), skip, rests: *rests };
+                let objective = Objective::Image { target, loss, scored: scored.as_ref(), skip };
                 let started = Instant::now();
                 self.adam.write(&gpu, 0, &[adam.setup(self.steps, *pace)]);
                 self.steps += 1;
@@ -213,7 +205,7 @@ impl Optimiser {
         loss: &LossConfig,
     ) -> Result<Gradients, GpuError> {
         let gpu = rasterizer.gpu().clone();
-        let objective = Objective::Image { target, loss, scored: None, skip: None, rests: false };
+        let objective = Objective::Image { target, loss, scored: None, skip: None };
         let mut gradients = self.collect(rasterizer, cloud, camera, [0.0; 3], &objective)?;
         gradients.loss = self.read_loss(&gpu, target)?;
         Ok(gradients)
@@ -286,8 +278,7 @@ impl Optimiser {
         sink: &Sink<'_>,
     ) -> Result<(), GpuError> {
         let gpu = rasterizer.gpu().clone();
-        let rests = matches!(objective, Objective::Image { rests: true, .. });
-        let prepared = rasterizer.prepare(cloud, camera, background, rests)?;
+        let prepared = rasterizer.prepare(cloud, camera, background)?;
         self.reserve(&gpu, &prepared.view, cloud)?;
         rasterizer.encode_clear(encoder);
         if let Objective::Image { target, .. } = objective {

@@ -11,8 +11,7 @@ use crate::geometry::Se3;
 use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, workgroups};
 use crate::splat::{GaussianCloud, ShDegree};
 
-/// Gaussians on the GPU, `[planes, capacity]` vec4 in each buffer. Plane 0 holds position and raw opacity, 1 the log scale and a mark (1
-/// where the Gaussian rests, else 0),
+/// Gaussians on the GPU, `[planes, capacity]` vec4 in each buffer. Plane 0 holds position and raw opacity, 1 the log scale,
 /// 2 the rotation (w, x, y, z), 3 the constant colour, 4… the other harmonics, RGB each.
 #[derive(Debug)]
 pub struct GpuCloud {
@@ -112,14 +111,6 @@ impl GpuCloud {
             let values: Vec<[f32; 4]> = geometry.iter().map(|g| g[plane]).collect();
             self.parameters.write(gpu, plane * self.capacity + keep.len(), &values);
         }
-        Ok(())
-    }
-
-    /// Marks the Gaussians that rest, `[N]`: steps of views that let them move no parameter of theirs.
-    pub fn mark_resting(&self, gpu: &Gpu, resting: &[bool]) -> Result<(), GpuError> {
-        let mut log_scales = self.read_plane(gpu, 1)?;
-        log_scales.iter_mut().zip(resting).for_each(|(log_scale, rests)| log_scale[3] = f32::from(u8::from(*rests)));
-        self.parameters.write(gpu, self.capacity, &log_scales);
         Ok(())
     }
 

@@ -129,15 +129,8 @@ impl Rasterizer {
     }
 
     /// Makes room for the view and tells the GPU of it; it must be submitted before another is prepared.
-    pub fn prepare(
-        &mut self,
-        cloud: &GpuCloud,
-        camera: &ViewCamera,
-        background: [f32; 3],
-        rests: bool,
-    ) -> Result<PreparedView, GpuError> {
+    pub fn prepare(&mut self, cloud: &GpuCloud, camera: &ViewCamera, background: [f32; 3]) -> Result<PreparedView, GpuError> {
         let mut view = View::new(camera, background);
-        view.background[3] = f32::from(u8::from(rests));
         self.workspace.reserve_gaussians(&self.gpu, cloud.capacity())?;
         self.workspace.reserve_image(&self.gpu, &view)?;
         view.gaussian_count = cloud.len() as u32;
@@ -242,7 +235,7 @@ impl Rasterizer {
     /// Renders a view and reads it back.
     pub fn render(&mut self, cloud: &GpuCloud, camera: &ViewCamera, background: [f32; 3]) -> Result<Rendered, GpuError> {
         loop {
-            let prepared = self.prepare(cloud, camera, background, false)?;
+            let prepared = self.prepare(cloud, camera, background)?;
             let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
             self.encode_clear(&mut encoder);
             self.encode_forward(&mut encoder.begin_compute_pass(&Default::default()), cloud, &prepared);

@@ -131,7 +131,7 @@ mod tests {
                 metres_per_pixel: 0.005,
                 ..GaussianScore::default()
             },
-            entry: Entry { age: 5, views: 12, best_weight: 0.5, worth: 20.0, ..Entry::default() },
+            entry: Entry { age: 5, views: 12, best_weight: 0.5, worth: 20.0, anchor: 0 },
         }
     }
 
