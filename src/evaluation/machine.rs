@@ -2,11 +2,16 @@
 
 /// The largest resident memory this process has had, bytes (`VmHWM`).
 pub fn peak_host_bytes() -> Option<u64> {
-    parse_peak_bytes(&std::fs::read_to_string("/proc/self/status").ok()?)
+    parse_bytes(&std::fs::read_to_string("/proc/self/status").ok()?, "VmHWM")
 }
 
-fn parse_peak_bytes(status: &str) -> Option<u64> {
-    let kibibytes = field(status, "VmHWM")?.strip_suffix("kB")?.trim().parse::<u64>().ok()?;
+/// The resident memory that this process has now, bytes (`VmRSS`).
+pub fn host_bytes() -> Option<u64> {
+    parse_bytes(&std::fs::read_to_string("/proc/self/status").ok()?, "VmRSS")
+}
+
+fn parse_bytes(status: &str, key: &str) -> Option<u64> {
+    let kibibytes = field(status, key)?.strip_suffix("kB")?.trim().parse::<u64>().ok()?;
     kibibytes.checked_mul(1024)
 }
 
@@ -34,8 +39,9 @@ mod tests {
 
     #[test]
     fn fields_are_found() {
-        assert_eq!(parse_peak_bytes("Name:\tx\nVmHWM:\t    2048 kB\nVmRSS:\t 12 kB\n"), Some(2048 * 1024));
-        assert_eq!(parse_peak_bytes("VmRSS:\t 12 kB\n"), None);
+        let status = "Name:\tx\nVmHWM:\t    2048 kB\nVmRSS:\t 12 kB\n";
+        assert_eq!([parse_bytes(status, "VmHWM"), parse_bytes(status, "VmRSS")], [Some(2048 * 1024), Some(12 * 1024)]);
+        assert_eq!(parse_bytes("VmRSS:\t 12 kB\n", "VmHWM"), None);
         assert_eq!(parse_cpu_name("processor\t: 0\nmodel name\t: A CPU @ 2 GHz\n").as_deref(), Some("A CPU @ 2 GHz"));
         assert_eq!(parse_cpu_name("processor\t: 0\nModel\t\t: A board\n").as_deref(), Some("A board"));
     }

@@ -35,4 +35,7 @@ pub struct KeyframeRecord {
     pub busy_s: f64,
     /// Messages that waited for the mapper when it began.
     pub waiting: usize,
+    /// Resident memory of the process when it was done, where the system tells.
+    #[serde(default)]
+    pub host_bytes: Option<u64>,
 }

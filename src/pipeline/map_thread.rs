@@ -8,6 +8,7 @@ use crossbeam::channel::Receiver;
 use super::measurements::Teller;
 use super::messages::guarded;
 use super::{KeyframeRecord, MapperMessage, PipelineError, Progress};
+use crate::evaluation::machine;
 use crate::gpu::Gpu;
 use crate::mapping::{KeyframeReport, Mapper, MappingConfig};
 use crate::splat::{GaussianCloud, MapSnapshot};
@@ -56,6 +57,7 @@ pub(super) fn map(
                     done_s: started.elapsed().as_secs_f64(),
                     busy_s: began.elapsed().as_secs_f64(),
                     waiting,
+                    host_bytes: machine::host_bytes(),
                 };
                 summary.keyframes.extend(report.map(record));
                 let psnr_db = summary.keyframes.last().map_or(0.0, |k| k.report.psnr_db);

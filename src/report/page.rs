@@ -102,6 +102,9 @@ fn plots_of(run: &Run) -> Result<String, String> {
         if !history.keyframes.is_empty() {
             add("Views that the mapper learns from, before each step", plots::keyframe_quality(&history.keyframes)?);
             add("Size of the map", plots::gaussians(&history.keyframes)?);
+            if history.keyframes.iter().any(|k| k.host_bytes.is_some()) {
+                add("Memory of the process", plots::memory(&history.keyframes)?);
+            }
             let caption = "Seconds for each keyframe (blue), and messages that waited for the mapper (orange)";
             add(caption, plots::mapper_load(&history.keyframes)?);
         }

@@ -158,6 +158,12 @@ pub fn gaussians(keyframes: &[KeyframeRecord]) -> Result<String, String> {
     lines(("seconds", "Gaussians, thousand"), from_zero(points.iter().map(|p| p.1)), &[(&points, LINE)], true)
 }
 
+/// Resident megabytes over the seconds.
+pub fn memory(keyframes: &[KeyframeRecord]) -> Result<String, String> {
+    let points: Vec<(f64, f64)> = keyframes.iter().filter_map(|k| Some((k.done_s, k.host_bytes? as f64 / 1e6))).collect();
+    lines(("seconds", "MB"), from_zero(points.iter().map(|p| p.1)), &[(&points, LINE)], true)
+}
+
 /// Seconds that each keyframe took the mapper, and messages that waited meanwhile.
 pub fn mapper_load(keyframes: &[KeyframeRecord]) -> Result<String, String> {
     let busy = numbered(keyframes, |k| k.busy_s);
