@@ -51,6 +51,8 @@ pub struct VcdConfig {
     pub min_age: u32,
     /// A Gaussian that never adds more than this to a pixel is removed.
     pub min_weight: f32,
+    /// One that never adds more than this to a view is removed too: pixels.
+    pub min_worth: f32,
     /// Of the Gaussians below this opacity, the half with more wrong pixels is removed.
     pub faint_opacity: f32,
 }
@@ -89,6 +91,7 @@ impl Default for VcdConfig {
             max_growth: 0.03,
             min_age: 2,
             min_weight: 0.02,
+            min_worth: 0.0,
             faint_opacity: 0.1,
         }
     }
@@ -137,7 +140,7 @@ impl DensityConfig {
         if let Some((name, value)) = positive.iter().find(|(_, value)| !(value.is_finite() && *value > 0.0)) {
             return Err(format!("{name} must be positive, not {value}"));
         }
-        let thresholds = [v.error_ratio, v.wrong_pixels, v.absolute_gradient, v.max_growth, c.gradient];
+        let thresholds = [v.error_ratio, v.wrong_pixels, v.absolute_gradient, v.max_growth, v.min_worth, c.gradient];
         if thresholds.iter().any(|t| !(t.is_finite() && *t >= 0.0)) {
             return Err("thresholds must be finite and not negative".into());
         }

@@ -37,7 +37,8 @@ fn median_score_of_faint(candidates: &[Candidate], config: &VcdConfig) -> f32 {
 
 /// Nothing would be missed without it, or it is faint and stands in the way.
 fn is_useless(c: &Candidate, faint_limit: f32, config: &VcdConfig) -> bool {
-    let never_seen_well = c.entry.views >= MIN_VIEWS && c.entry.best_weight < config.min_weight;
+    let adds_little = c.entry.best_weight < config.min_weight || c.entry.worth < config.min_worth;
+    let never_seen_well = c.entry.views >= MIN_VIEWS && adds_little;
     let in_the_way = is_faint(c, config) && c.score.weighted_wrong_pixels > faint_limit;
     c.entry.age >= config.min_age && (never_seen_well || in_the_way)
 }
