@@ -15,7 +15,7 @@ for target in "$@"; do
     mkdir -p "$found"
     echo "fuzz: $target for $seconds s"
     cargo +nightly fuzz run -s none --fuzz-dir . "$target" "$found" "corpus/$target" -- \
-        -max_total_time="$seconds" -timeout=5 -rss_limit_mb=1024 -malloc_limit_mb=256 -max_len=65536 -print_final_stats=1 2>&1 |
+        -max_total_time="$seconds" -timeout=60 -rss_limit_mb=1024 -malloc_limit_mb=256 -max_len=65536 -print_final_stats=1 2>&1 |
         grep -E "ERROR|panicked|SUMMARY|stat::(number_of_executed_units|peak_rss_mb)|Test unit" || true
     [ -z "$(ls "artifacts/$target" 2>/dev/null)" ] || { echo "fuzz: $target crashed, see fuzz/artifacts/$target" >&2; exit 1; }
 done

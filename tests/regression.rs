@@ -10,6 +10,13 @@ fn replay(family: &str, seed: u64, index: usize) {
     assert!(outcome.failures().is_empty(), "{family}, case {index}: {:?}", outcome.failures());
 }
 
+/// One point that began behind a camera that sees it made the whole adjustment's cost infinite: no step lowered it, and nothing was adjusted
+/// until everything had been judged as it stood.
+#[test]
+fn points_behind_a_camera_do_not_stop_the_adjustment() {
+    (0..5).for_each(|index| replay("bundle: points begin behind", 1, index));
+}
+
 /// Where a loop of a mono map closes, both keyframes stand nearly in one place, and reprojections say nothing of the scale between them: the
 /// refinement walked off along it, by up to 84%, from a start that was right to a thousandth.
 #[test]

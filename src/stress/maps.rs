@@ -20,14 +20,15 @@ const STEPS: usize = 10;
 pub fn families() -> Vec<Family<'static>> {
     let bundles = WORLDS.into_iter().flat_map(|(name, world)| {
         [(false, ""), (true, ", depth")].map(|(with_depth, more)| {
-            let case = move |rng: &mut Rng| Ok(bundle(rng, &world, with_depth, 0.3));
+            let case = move |rng: &mut Rng| Ok(bundle(rng, &world, with_depth, 0.3, 0));
             Family::new(Part::Tracker, format!("bundle: {name}{more}"), 10, case)
         })
     });
     let baselines = [0.03, 0.003].into_iter().map(|metres| {
-        let case = move |rng: &mut Rng| Ok(bundle(rng, &VOLUME, false, metres));
+        let case = move |rng: &mut Rng| Ok(bundle(rng, &VOLUME, false, metres, 0));
         Family::new(Part::Tracker, format!("bundle: baseline {metres}"), 10, case)
     });
+    let behind = Family::new(Part::Tracker, "bundle: points begin behind", 10, |rng| Ok(bundle(rng, &VOLUME, false, 0.3, 5)));
     let graphs = GRAPHS.into_iter().map(|(name, graph)| {
         Family::new(Part::Tracker, format!("pose graph: {name}"), 10, move |rng| Ok(pose_graph(rng, &graph)))
     });
@@ -45,11 +46,12 @@ pub fn families() -> Vec<Family<'static>> {
     });
     let same_place =
         Family::new(Part::Tracker, "align keyframes: same place, scale free", 2, |rng| Ok(keyframes(rng, &VOLUME, true, 1e-3)));
-    bundles.chain(baselines).chain(graphs).chain(sets).chain(both).chain([same_place]).collect()
+    bundles.chain(baselines).chain([behind]).chain(graphs).chain(sets).chain(both).chain([same_place]).collect()
 }
 
-/// Six cameras `metres` apart on an arc before 80 points, the last two held; a twentieth of the measurements is wrong.
-fn bundle(rng: &mut Rng, world: &World, with_depth: bool, metres: f64) -> Outcome {
+/// Six cameras `metres` apart on an arc before 80 points, the last two held; a twentieth of the measurements is wrong. Some points are
+/// believed `behind` the cameras at first.
+fn bundle(rng: &mut Rng, world: &World, with_depth: bool, metres: f64, behind: usize) -> Outcome {
     let world_from_home = world.placed(rng);
     let mut truth = BundleProblem { free_poses: 4, ..Default::default() };
     let at_home: Vec<Se3> = (0..6)
@@ -74,10 +76,11 @@ fn bundle(rng: &mut Rng, world: &World, with_depth: bool, metres: f64) -> Outcom
         *pose =
             super::geometry::step(pose, &pose_error(&small_motion(rng, 0.02 * metres, 0.01), &Se3::identity(), 1.0), world.scale);
     }
-    for point in &mut problem.points {
+    for (index, point) in problem.points.iter_mut().enumerate() {
         // Along the line of sight mostly, as triangulation errs.
         let p_in_camera = world_from_home.inverse().act(point).coords;
-        *point = world_from_home.act(&Point3::from(p_in_camera * (1.0 + 0.02 * gauss(rng))));
+        let side = if index < behind { -1.0 } else { 1.0 };
+        *point = world_from_home.act(&Point3::from(p_in_camera * (1.0 + 0.02 * gauss(rng)) * side));
     }
     solve_bundle(&mut problem, &mut truth, world)
 }

@@ -84,6 +84,13 @@ pub struct Outcome {
     pub faults: Vec<String>,
 }
 
+impl Measured {
+    /// A NaN is above every limit.
+    fn is_within(&self) -> bool {
+        self.value <= self.limit
+    }
+}
+
 impl Outcome {
     /// Notes a number that must be at most `limit`.
     fn measure(&mut self, quantity: &'static str, value: f64, limit: f64) {
@@ -105,10 +112,9 @@ impl Outcome {
         }
     }
 
-    /// All that is wrong; a NaN is above every limit.
+    /// All that is wrong.
     pub fn failures(&self) -> Vec<String> {
-        let within = |m: &&Measured| m.value <= m.limit || (m.limit.is_infinite() && !m.value.is_nan());
-        let over = self.measured.iter().filter(|m| !within(m));
+        let over = self.measured.iter().filter(|m| !m.is_within());
         let words = over.map(|m| format!("{} is {:.3e}, above {:.1e}", m.quantity, m.value, m.limit));
         self.faults.iter().cloned().chain(words).collect()
     }

@@ -50,7 +50,7 @@ fn view64(scene: &Scene) -> View64 {
     View64 { camera: scene.camera, background: Vector3::from(BACKGROUND).map(f64::from), cutoffs: Cutoffs::Sharp }
 }
 
-/// Largest difference over largest magnitude. `which` says which entries count.
+/// Largest difference over largest magnitude, of `(got, wanted)`.
 fn error(pairs: impl Iterator<Item = (f64, f64)>, floor: f64) -> f64 {
     let (difference, magnitude) = pairs.fold((0.0f64, floor), |(difference, magnitude), (got, wanted)| {
         // A NaN must not be swallowed by `max`.
@@ -137,22 +137,21 @@ fn compare(
 fn shifted(machine: &Machine, rng: &mut Rng, metres: f64) -> Result<Outcome, GpuError> {
     let scene = Scene::random(rng, Fault::None);
     let away = Se3::translation(0.7 * metres, -0.1 * metres, 0.7 * metres);
-    let mut there = scene.moved(&away, 1.0);
+    let there = scene.moved(&away, 1.0);
     // Cut-offs are taken as they come: what they do to the image is part of the loss.
     let pixels = (scene.camera.pinhole.width * scene.camera.pinhole.height) as usize;
     let (view, wide) = (view64(&scene), cloud64(&scene.cloud));
-    there.cloud.sh_degree = scene.cloud.sh_degree;
     let limits = [f64::INFINITY, f64::INFINITY];
     let mut outcome = compare(machine, rng, &there, (&view, &wide, &vec![true; pixels]), limits)?;
     let on_gpu = machine.upload(&there.cloud)?;
     let rendered = machine.with(0, |rasterizer, _| rasterizer.render(&on_gpu, &there.camera, BACKGROUND))?;
-    outcome.note("PSNR against home, dB", psnr_db(&rendered, &rasterize_forward::render(&view, &wide)));
+    outcome.note("colours against home, RMS", rms(&rendered, &rasterize_forward::render(&view, &wide)));
     // What the positions alone lose by being written in f32 there: the same, rendered by the oracle.
     let back = away.inverse();
     let mut rounded = scene.cloud.clone();
     rounded.means = there.cloud.means.iter().map(|m| narrow(&(back * Point3::from(m.to_array().map(f64::from))))).collect();
     let rounded = rasterize_forward::render(&view, &cloud64(&rounded));
-    outcome.note("PSNR of rounded positions, dB", psnr_db(&rendered_of(&rounded), &rasterize_forward::render(&view, &wide)));
+    outcome.note("of rounded positions alone, RMS", rms(&rendered_of(&rounded), &rasterize_forward::render(&view, &wide)));
     Ok(outcome)
 }
 
@@ -162,9 +161,8 @@ fn rendered_of(image: &Image64) -> Rendered {
     Rendered { width: 0, height: 0, color_depth: color_depth.collect(), transmittance }
 }
 
-fn psnr_db(got: &Rendered, wanted: &Image64) -> f64 {
+fn rms(got: &Rendered, wanted: &Image64) -> f64 {
     let squares =
         got.color_depth.iter().zip(&wanted.color).flat_map(|(g, w)| (0..3).map(move |c| (f64::from(g[c]) - w[c]).powi(2)));
-    let count = 3 * wanted.color.len();
-    -10.0 * (squares.sum::<f64>() / count as f64).max(1e-15).log10()
+    (squares.sum::<f64>() / (3 * wanted.color.len()) as f64).sqrt()
 }

@@ -102,7 +102,7 @@ impl Row {
         Self {
             quantity,
             cases: all.len(),
-            failures: all.iter().filter(|(m, _)| !(m.value <= m.limit)).count(),
+            failures: all.iter().filter(|(m, _)| !m.is_within()).count(),
             median: at(0.5).0.value,
             percentile_95: at(0.95).0.value,
             worst: worst.value,

@@ -107,9 +107,7 @@ impl Fault {
             Self::FarAway => gaussian.mean *= 10f32.powf(6.0 * strength),
             Self::Opacity => gaussian.raw_opacity = 120.0 * (strength - 0.5),
             Self::AlphaCutOff => gaussian.raw_opacity = -5.537_334 + 1e-3 * (strength - 0.5),
-            Self::NoRotation => {
-                gaussian.rotation = gaussian.rotation * if strength < 0.2 { 0.0 } else { 10f32.powf(-6.0 * strength) }
-            }
+            Self::NoRotation => gaussian.rotation *= if strength < 0.2 { 0.0 } else { 10f32.powf(-6.0 * strength) },
             Self::OutOfGamut => gaussian.sh[0] *= 50.0 * strength,
             Self::Any => Self::OF_GAUSSIANS[rng.usize(..Self::OF_GAUSSIANS.len())].spoil(rng, camera, gaussian),
             Self::None | Self::Crowd | Self::OnePixelImage | Self::OddImage => {}
