@@ -125,11 +125,16 @@ impl Config {
     /// The same; `known_poses` says it, whatever the file does.
     pub fn read_with(path: &Path, known_poses: bool) -> Result<Self, ConfigError> {
         let text = std::fs::read_to_string(path).map_err(|source| ConfigError::Read { path: path.into(), source })?;
+        Self::parse(&text, path, known_poses)
+    }
+
+    /// The same of a text; `path` is named in errors.
+    pub fn parse(text: &str, path: &Path, known_poses: bool) -> Result<Self, ConfigError> {
         let syntax = |source| ConfigError::Syntax { path: path.into(), source: Box::new(source) };
-        let mut config: Self = toml::from_str(&text).map_err(syntax)?;
+        let mut config: Self = toml::from_str(text).map_err(syntax)?;
         if known_poses || config.replay.known_poses {
             let mut table = toml::Table::try_from(Self::offline()).expect("a configuration is plain data");
-            overlay(&mut table, toml::from_str(&text).map_err(syntax)?);
+            overlay(&mut table, toml::from_str(text).map_err(syntax)?);
             config = table.try_into().map_err(syntax)?;
             config.replay.known_poses = true;
         }

@@ -15,4 +15,5 @@ pub mod render;
 pub mod report;
 pub mod sequence;
 pub mod splat;
+pub mod stress;
 pub mod tracking;

@@ -8,6 +8,7 @@ mod generate;
 mod progress;
 mod report;
 mod run;
+mod stress;
 
 use std::io::{ErrorKind, IsTerminal, Write};
 use std::process::ExitCode;
@@ -52,6 +53,8 @@ enum Command {
     Report(report::ReportArgs),
     /// Measure speed.
     Bench(bench::BenchArgs),
+    /// Try thousands of nasty cases against what is known of them.
+    Stress(stress::StressArgs),
     /// List the adapters that the mapper could use.
     Adapters,
 }
@@ -93,6 +96,7 @@ fn execute(command: Command, verbosity: Verbosity) -> miette::Result<()> {
         Command::Eval(args) => eval::eval(&args, verbosity),
         Command::Report(args) => report::report(&args, verbosity),
         Command::Bench(args) => bench::bench(&args, verbosity),
+        Command::Stress(args) => stress::stress(&args),
         Command::Adapters => adapters::adapters(),
     }
 }

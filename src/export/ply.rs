@@ -91,7 +91,12 @@ pub fn read(path: &Path) -> Result<GaussianCloud, ExportError> {
     let read_error = |source| ExportError::Read { path: path.into(), source };
     let file = std::fs::File::open(path).map_err(read_error)?;
     let file_bytes = file.metadata().map_err(read_error)?.len();
-    let mut reader = BufReader::new(file);
+    read_from(BufReader::new(file), file_bytes, path)
+}
+
+/// The same from a reader of `file_bytes` bytes; `path` is named in errors.
+pub fn read_from(mut reader: impl BufRead, file_bytes: u64, path: &Path) -> Result<GaussianCloud, ExportError> {
+    let read_error = |source| ExportError::Read { path: path.into(), source };
     let (lines, header_bytes) = header_lines(&mut reader, path)?;
     let layout = parse_header(&lines, path)?;
 

@@ -1,5 +1,5 @@
 //! The oracle: the stages of the rasterizer and the optimiser on the CPU in f64, written for clarity. Finite differences check it
-//! (`tests/reference_gradients.rs`), and it checks the GPU (`tests/gpu_against_reference.rs`). Nothing in production imports it.
+//! (`tests/reference_gradients.rs`), and it checks the GPU (`tests/gpu_against_reference.rs`). Nothing in production imports it; `stress` does, which is a test.
 
 pub mod adam;
 pub mod loss;

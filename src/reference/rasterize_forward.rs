@@ -48,10 +48,10 @@ pub(super) fn contributions(view: &View64, sorted: &[(usize, Projected64)], x: u
     (found, transmittance)
 }
 
-/// How far f32 can be trusted with a view.
+/// How far f32 can be trusted with a view, or with a pixel of it.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Conditioning {
-    /// (Gaussian, pixel) pairs so close to a cut-off that rounding may decide them either way.
+    /// (Gaussian, pixel) pairs so close to a cut-off, or to another one's depth, that rounding may decide them either way.
     pub near_cutoffs: usize,
     /// Largest rounding error of an exponent that counts.
     pub exponent_error: f64,
@@ -59,10 +59,18 @@ pub struct Conditioning {
 
 /// Judges a view; `slack` is the relative width of the band around the cut-offs.
 pub fn conditioning(view: &View64, cloud: &[Gaussian64], slack: f64) -> Conditioning {
+    pixel_conditioning(view, cloud, slack).into_iter().fold(Conditioning::default(), |all, pixel| Conditioning {
+        near_cutoffs: all.near_cutoffs + pixel.near_cutoffs,
+        exponent_error: all.exponent_error.max(pixel.exponent_error),
+    })
+}
+
+/// The same of each pixel, `[H * W]`.
+pub fn pixel_conditioning(view: &View64, cloud: &[Gaussian64], slack: f64) -> Vec<Conditioning> {
     let sorted = sorted(view, cloud);
     let p = &view.camera.pinhole;
-    let mut judged = Conditioning::default();
-    for (x, y) in (0..p.height).flat_map(|y| (0..p.width).map(move |x| (x, y))) {
+    let pixel = |(x, y): (u32, u32)| {
+        let mut judged = Conditioning::default();
         for (_, g) in &sorted {
             let d = Vector2::new(f64::from(x), f64::from(y)) - g.mean;
             let power = -0.5 * (d.transpose() * g.conic * d)[0];
@@ -79,9 +87,16 @@ pub fn conditioning(view: &View64, cloud: &[Gaussian64], slack: f64) -> Conditio
         }
         let (found, transmittance) = contributions(view, &sorted, x, y);
         let finishing = transmittance < model::TRANSMITTANCE_MIN * 1.02 || found.iter().any(|c| c.transmittance < 1e-3);
-        judged.near_cutoffs += usize::from(finishing);
-    }
-    judged
+        let order_is_open = |pair: &[Contribution]| {
+            let [(i, a), (k, b)] = [0, 1].map(|side| &sorted[pair[side].index]);
+            // A depth in f32 is off by a few roundings of its terms. Equal means have equal depths, and keep the map's order.
+            let terms = cloud[*i].mean.abs().sum() + cloud[*k].mean.abs().sum() + a.depth;
+            (b.depth - a.depth).abs() < 4.0 * f64::from(f32::EPSILON) * terms && cloud[*i].mean != cloud[*k].mean
+        };
+        judged.near_cutoffs += usize::from(finishing) + found.windows(2).filter(|pair| order_is_open(pair)).count();
+        judged
+    };
+    (0..p.height).flat_map(|y| (0..p.width).map(move |x| (x, y))).map(pixel).collect()
 }
 
 /// Renders the map.

@@ -27,7 +27,8 @@ pub(super) fn open(folder: &Path) -> Result<Sequence, SequenceError> {
     let lefts = read_list(&left)?;
     let has_right = right.join("data.csv").is_file();
     let rights = if has_right { read_list(&right)? } else { Vec::new() };
-    let (camera, mut body_from_camera) = read_sensor(&left.join("sensor.yaml"))?;
+    let sensor = left.join("sensor.yaml");
+    let (camera, mut body_from_camera) = parse_sensor(&read_text(&sensor)?, &sensor)?;
     let entry = |left: ListedImage| FrameEntry {
         timestamp_s: seconds(left.timestamp_ns),
         right: nearest(&rights, left.timestamp_ns),
@@ -43,7 +44,7 @@ pub(super) fn open(folder: &Path) -> Result<Sequence, SequenceError> {
         body_from_camera *= rectified_from_left.inverse();
     }
     let truth = folder.join("mav0/state_groundtruth_estimate0/data.csv");
-    sequence.groundtruth = truth.is_file().then(|| read_truth(&truth, &body_from_camera)).transpose()?;
+    sequence.groundtruth = truth.is_file().then(|| parse_truth(&read_text(&truth)?, &truth, &body_from_camera)).transpose()?;
     Ok(sequence)
 }
 
@@ -54,7 +55,7 @@ fn rectify(sequence: &mut Sequence, right: &Path, body_from_left: &Se3) -> Resul
         return Err(SequenceError::Content { path: right.join("data.csv"), what });
     }
     let path = right.join("sensor.yaml");
-    let (right_camera, body_from_right) = read_sensor(&path)?;
+    let (right_camera, body_from_right) = parse_sensor(&read_text(&path)?, &path)?;
     let pair = stereo::rectify(&sequence.camera, &right_camera, &(body_from_left.inverse() * body_from_right))
         .map_err(|what| SequenceError::Content { path, what })?;
     sequence.camera = Camera { pinhole: pair.pinhole, distortion: Distortion::default(), ..sequence.camera };
@@ -80,10 +81,10 @@ struct Matrix {
     data: Vec<f64>,
 }
 
-/// A camera, and its pose in the body's frame.
-fn read_sensor(path: &Path) -> Result<(Camera, Se3), SequenceError> {
+/// A camera, and its pose in the body's frame, from a `sensor.yaml`; `path` is named in errors.
+pub(super) fn parse_sensor(text: &str, path: &Path) -> Result<(Camera, Se3), SequenceError> {
     let content = |what: String| SequenceError::Content { path: path.into(), what };
-    let file: SensorFile = serde_saphyr::from_str(&read_text(path)?).map_err(|error| {
+    let file: SensorFile = serde_saphyr::from_str(text).map_err(|error| {
         let what = error.without_snippet().to_string();
         match error.location() {
             Some(place) => SequenceError::Syntax { path: path.into(), line: place.line() as usize, what },
@@ -116,7 +117,7 @@ struct ListedImage {
 fn read_list(camera: &Path) -> Result<Vec<ListedImage>, SequenceError> {
     let list = camera.join("data.csv");
     let mut images: Vec<ListedImage> = Vec::new();
-    for row in read_rows(&list)? {
+    for row in parse_rows(&read_text(&list)?, &list)? {
         let file = row.fields.first().ok_or_else(|| syntax(&list, row.line, "expected `timestamp [ns],file`".into()))?;
         let path = camera.join("data").join(file);
         if !path.is_file() {
@@ -135,10 +136,10 @@ fn nearest(images: &[ListedImage], timestamp_ns: u64) -> Option<PathBuf> {
     (nearest.timestamp_ns.abs_diff(timestamp_ns) <= MAX_PAIR_NS).then(|| nearest.path.clone())
 }
 
-/// The camera's poses, from the body's.
-fn read_truth(path: &Path, body_from_camera: &Se3) -> Result<Trajectory, SequenceError> {
+/// The camera's poses, from a table of the body's; `path` is named in errors.
+pub(super) fn parse_truth(text: &str, path: &Path, body_from_camera: &Se3) -> Result<Trajectory, SequenceError> {
     let mut poses = Vec::new();
-    for row in read_rows(path)? {
+    for row in parse_rows(text, path)? {
         let numbers: Vec<f64> = row.fields.iter().take(7).map_while(|field| field.parse().ok()).collect();
         let &[x, y, z, qw, qx, qy, qz] = numbers.as_slice() else {
             return Err(syntax(path, row.line, "expected `timestamp [ns],x,y,z,qw,qx,qy,qz`".into()));
@@ -152,16 +153,16 @@ fn read_truth(path: &Path, body_from_camera: &Se3) -> Result<Trajectory, Sequenc
 }
 
 /// A line of a table: its time and what follows it.
-struct Row {
+pub(super) struct Row {
     line: usize,
     timestamp_ns: u64,
     fields: Vec<String>,
 }
 
-/// The rows of a table with ascending times in its first column.
-fn read_rows(path: &Path) -> Result<Vec<Row>, SequenceError> {
+/// The rows of a table with ascending times in its first column; `path` is named in errors.
+pub(super) fn parse_rows(text: &str, path: &Path) -> Result<Vec<Row>, SequenceError> {
     let mut rows: Vec<Row> = Vec::new();
-    for (index, line) in read_text(path)?.lines().enumerate() {
+    for (index, line) in text.lines().enumerate() {
         if line.trim().is_empty() || line.starts_with('#') {
             continue;
         }
@@ -272,7 +273,8 @@ mod tests {
         let folder = recording();
         let sequence = open(&folder).unwrap();
         let world_from_camera = sequence.groundtruth.as_ref().unwrap().poses[0].world_from_camera;
-        let (raw, body_from_raw) = read_sensor(&folder.path().join("mav0/cam0/sensor.yaml")).unwrap();
+        let (raw, body_from_raw) =
+            parse_sensor(&read_text(&folder.path().join("mav0/cam0/sensor.yaml")).unwrap(), folder.path()).unwrap();
         let world_from_body = checks::rigid_of_quaternion([1.0, 2.0, 3.0], [0.5; 4]).unwrap();
         let frame = sequence.load(0).unwrap();
         let mut mono = sequence.clone();

@@ -15,9 +15,9 @@ pub fn read_text(path: &Path) -> Result<String, SequenceError> {
     std::fs::read_to_string(path).map_err(|source| SequenceError::Read { path: path.into(), source })
 }
 
-/// A JSON file as what it should hold; what does not fit is named with its line.
-pub fn read_json<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T, SequenceError> {
-    serde_json::from_str(&read_text(path)?).map_err(|error| SequenceError::Syntax {
+/// JSON as what it should hold; what does not fit is named with its line in `path`.
+pub fn parse_json<T: serde::de::DeserializeOwned>(text: &str, path: &Path) -> Result<T, SequenceError> {
+    serde_json::from_str(text).map_err(|error| SequenceError::Syntax {
         path: path.into(),
         line: error.line(),
         what: error.to_string(),

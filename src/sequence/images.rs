@@ -59,7 +59,7 @@ pub(super) fn recognise(folder: &Path) -> bool {
 pub(super) fn open(folder: &Path) -> Result<Sequence, SequenceError> {
     let path = folder.join(FILE);
     let content = |what: &str| SequenceError::Content { path: path.clone(), what: what.into() };
-    let (camera, file) = read_camera(&path)?;
+    let (camera, file) = parse_camera(&read_text(&path)?, &path)?;
     let rgb = folder.join("rgb");
     let (color_folder, other_folder, sensor) = match file.stereo {
         Some(StereoTable { baseline_metres }) => {
@@ -86,10 +86,10 @@ pub(super) fn open(folder: &Path) -> Result<Sequence, SequenceError> {
     Ok(sequence)
 }
 
-/// Reads a camera's file and checks its numbers.
-pub(super) fn read_camera(path: &Path) -> Result<(Camera, CameraFile), SequenceError> {
+/// Parses a camera's file and checks its numbers; `path` is named in errors.
+pub(super) fn parse_camera(text: &str, path: &Path) -> Result<(Camera, CameraFile), SequenceError> {
     let content = |what: String| SequenceError::Content { path: path.into(), what };
-    let file = read_camera_file(path)?;
+    let file = parse_camera_file(text, path)?;
     let depth_units_per_metre = file.depth_units_per_metre.unwrap_or(1.0);
     let camera = checks::camera(Camera { pinhole: file.pinhole, distortion: file.distortion, depth_units_per_metre });
     if !(file.fps.is_finite() && file.fps > 0.0) {
@@ -98,9 +98,8 @@ pub(super) fn read_camera(path: &Path) -> Result<(Camera, CameraFile), SequenceE
     Ok((camera.map_err(content)?, file))
 }
 
-fn read_camera_file(path: &Path) -> Result<CameraFile, SequenceError> {
-    let text = read_text(path)?;
-    toml::from_str(&text).map_err(|error| {
+fn parse_camera_file(text: &str, path: &Path) -> Result<CameraFile, SequenceError> {
+    toml::from_str(text).map_err(|error| {
         let before = error.span().and_then(|span| text.get(..span.start)).unwrap_or_default();
         let line = before.matches('\n').count() + 1;
         SequenceError::Syntax { path: path.into(), line, what: error.message().into() }
@@ -186,7 +185,7 @@ mod tests {
         let folder = recording(example, &[]);
         assert!(open(&folder).unwrap_err().contains("lists no frames"));
         std::fs::write(folder.path().join(FILE), example.replace("# stereo", "stereo")).unwrap();
-        assert!(read_camera_file(&folder.path().join(FILE)).unwrap().stereo.is_some());
+        assert!(parse_camera_file(&read_text(&folder.path().join(FILE)).unwrap(), Path::new(FILE)).unwrap().stereo.is_some());
     }
 
     #[test]

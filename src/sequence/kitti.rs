@@ -25,7 +25,8 @@ pub(super) fn open(folder: &Path) -> Result<Sequence, SequenceError> {
         .ok_or_else(|| SequenceError::Missing(folder.join(CAMERAS[0].0)))?;
     let lefts = images_in(&folder.join(left))?;
     let rights = if folder.join(right).is_dir() { images_in(&folder.join(right))? } else { Vec::new() };
-    let calibration = Calibration::read(&folder.join("calib.txt"))?;
+    let calibration = folder.join("calib.txt");
+    let calibration = Calibration::parse(&read_text(&calibration)?, &calibration)?;
     let first = lefts.first().ok_or_else(|| SequenceError::Empty { path: folder.join(left) })?;
     let (width, height) =
         image::image_dimensions(first).map_err(|source| SequenceError::Image { path: first.clone(), source })?;
@@ -50,20 +51,20 @@ pub(super) fn open(folder: &Path) -> Result<Sequence, SequenceError> {
         .zip(&times)
         .map(|(color, &timestamp_s)| FrameEntry { timestamp_s, right: right_of(&color), color, depth: None })
         .collect();
-    let groundtruth = truth_file(folder).map(|path| read_poses(&path, &times)).transpose()?;
+    let groundtruth = truth_file(folder).map(|path| parse_poses(&read_text(&path)?, &path, &times)).transpose()?;
     let camera = Camera { pinhole, distortion: Distortion::default(), depth_units_per_metre: 1.0 };
     Ok(Sequence { groundtruth, ..Sequence::new(folder_name(folder), Layout::Kitti, camera, sensor, entries) })
 }
 
 /// The projections of a calibration file, each with its name where it has one.
-struct Calibration {
+pub(super) struct Calibration {
     path: PathBuf,
     projections: Vec<(Option<String>, Vec<f64>)>,
 }
 
 impl Calibration {
-    fn read(path: &Path) -> Result<Self, SequenceError> {
-        let text = read_text(path)?;
+    /// `path` is named in errors.
+    pub(super) fn parse(text: &str, path: &Path) -> Result<Self, SequenceError> {
         let mut projections = Vec::new();
         for (index, line) in text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty()) {
             let (name, numbers) = match line.split_once(':') {
@@ -80,7 +81,7 @@ impl Calibration {
     }
 
     /// The projection of that name, or at that place where they have no names.
-    fn of(&self, name: &str, place: usize) -> Result<&[f64], SequenceError> {
+    pub(super) fn of(&self, name: &str, place: usize) -> Result<&[f64], SequenceError> {
         let named = self.projections.iter().find(|(n, _)| n.as_deref() == Some(name));
         let found = named.or_else(|| self.projections.get(place).filter(|(n, _)| n.is_none()));
         let (_, projection) = found.ok_or_else(|| self.wrong(&format!("there is no projection {name}")))?;
@@ -104,8 +105,13 @@ fn read_times(path: &Path, frames: usize) -> Result<Vec<f64>, SequenceError> {
     if !path.is_file() {
         return Ok((0..frames).map(|i| i as f64 * FRAME_S).collect());
     }
+    parse_times(&read_text(path)?, path, frames)
+}
+
+/// The times of so many frames, seconds; `path` is named in errors.
+pub(super) fn parse_times(text: &str, path: &Path, frames: usize) -> Result<Vec<f64>, SequenceError> {
     let mut times: Vec<f64> = Vec::new();
-    for (index, line) in read_text(path)?.lines().enumerate().filter(|(_, line)| !line.trim().is_empty()) {
+    for (index, line) in text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty()) {
         let time: f64 = line.trim().parse().map_err(|_| syntax(path, index, format!("`{line}` is not a time in seconds")))?;
         if !time.is_finite() || times.last().is_some_and(|last| time <= *last) {
             return Err(syntax(path, index, format!("the time {line} is not finite and after the one before it")));
@@ -124,9 +130,9 @@ fn truth_file(folder: &Path) -> Option<PathBuf> {
     [beside, elsewhere].into_iter().find(|path| path.is_file())
 }
 
-fn read_poses(path: &Path, times: &[f64]) -> Result<Trajectory, SequenceError> {
+/// The truth at those times, seconds; `path` is named in errors.
+pub(super) fn parse_poses(text: &str, path: &Path, times: &[f64]) -> Result<Trajectory, SequenceError> {
     let mut poses = Vec::new();
-    let text = read_text(path)?;
     for ((index, line), &timestamp_s) in text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty()).zip(times) {
         let m = checks::numbers(line, 12).map_err(|what| syntax(path, index, what))?;
         let world_from_camera = checks::rigid(&m).map_err(|what| syntax(path, index, what))?;

@@ -9,6 +9,7 @@ mod euroc;
 mod files;
 mod images;
 mod kitti;
+mod parsing;
 mod rectify;
 mod replica;
 mod stereo;
@@ -28,7 +29,7 @@ use serde::{Deserialize, Serialize};
 use crate::geometry::{Camera, Trajectory, TrajectoryError};
 
 pub use cameras::is_file as is_camera_file;
-use files::{decode, files_in, folder_name, images_in, read_json, read_text};
+use files::{decode, files_in, folder_name, images_in, parse_json, read_text};
 pub use rectify::{RectifiedImage, Rectifier};
 use stereo::StereoRemap;
 use video::Video;

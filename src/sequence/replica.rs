@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
-use super::{FrameEntry, Layout, Sensor, Sequence, SequenceError, checks, folder_name, images_in, read_json, read_text};
+use super::{FrameEntry, Layout, Sensor, Sequence, SequenceError, checks, folder_name, images_in, parse_json, read_text};
 use crate::geometry::{Camera, Distortion, Pinhole, StampedPose, Trajectory};
 
 const FRAMES_PER_S: f64 = 30.0;
@@ -32,7 +32,8 @@ pub(super) fn open(folder: &Path) -> Result<Sequence, SequenceError> {
         return Err(SequenceError::Empty { path: results });
     }
     let sensor = if entries.iter().any(|entry| entry.depth.is_some()) { Sensor::Rgbd } else { Sensor::Mono };
-    let groundtruth = Some(read_poses(&folder.join("traj.txt"), &colors)?);
+    let truth = folder.join("traj.txt");
+    let groundtruth = Some(parse_poses(&read_text(&truth)?, &truth, colors.keys())?);
     let camera = read_camera(folder)?;
     let sequence = Sequence { groundtruth, ..Sequence::new(folder_name(folder), Layout::Replica, camera, sensor, entries) };
     sequence.check_first_size()?;
@@ -72,18 +73,26 @@ fn read_camera(folder: &Path) -> Result<Camera, SequenceError> {
         path: folder.into(),
         what: "there is no cam_params.json here or one folder up; copy the one that comes with the rooms".into(),
     })?;
-    let CameraNumbers { w, h, fx, fy, cx, cy, scale } = read_json::<CameraFile>(&path)?.camera;
-    let pinhole = Pinhole { fx, fy, cx, cy, width: w, height: h };
-    checks::camera(Camera { pinhole, distortion: Distortion::default(), depth_units_per_metre: scale })
-        .map_err(|what| SequenceError::Content { path, what })
+    parse_camera(&read_text(&path)?, &path)
 }
 
-/// The poses of the frames that are there.
-fn read_poses(path: &Path, frames: &BTreeMap<usize, PathBuf>) -> Result<Trajectory, SequenceError> {
-    let text = read_text(path)?;
+/// The camera of a `cam_params.json`; `path` is named in errors.
+pub(super) fn parse_camera(text: &str, path: &Path) -> Result<Camera, SequenceError> {
+    let CameraNumbers { w, h, fx, fy, cx, cy, scale } = parse_json::<CameraFile>(text, path)?.camera;
+    let pinhole = Pinhole { fx, fy, cx, cy, width: w, height: h };
+    checks::camera(Camera { pinhole, distortion: Distortion::default(), depth_units_per_metre: scale })
+        .map_err(|what| SequenceError::Content { path: path.into(), what })
+}
+
+/// The poses of the frames with these numbers; `path` is named in errors.
+pub(super) fn parse_poses<'a>(
+    text: &str,
+    path: &Path,
+    frames: impl Iterator<Item = &'a usize>,
+) -> Result<Trajectory, SequenceError> {
     let lines: Vec<(usize, &str)> = text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty()).collect();
-    let mut poses = Vec::with_capacity(frames.len());
-    for &number in frames.keys() {
+    let mut poses = Vec::new();
+    for &number in frames {
         let &(index, line) = lines.get(number).ok_or_else(|| SequenceError::Content {
             path: path.into(),
             what: format!("{} poses, none for frame {number}; check that the recording was copied whole", lines.len()),

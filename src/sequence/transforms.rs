@@ -12,8 +12,8 @@ use std::path::{Path, PathBuf};
 use nalgebra::{UnitQuaternion, Vector3};
 use serde::Deserialize;
 
-use super::{FrameEntry, Layout, Sensor, Sequence, SequenceError, checks, folder_name, read_json};
-use crate::geometry::{Camera, Distortion, Pinhole, StampedPose, Trajectory};
+use super::{FrameEntry, Layout, Sensor, Sequence, SequenceError, checks, folder_name, parse_json, read_text};
+use crate::geometry::{Camera, Distortion, Pinhole, Se3, StampedPose, Trajectory};
 
 const FILE: &str = "transforms.json";
 /// Endings of photos whose path leaves it out.
@@ -26,18 +26,15 @@ pub(super) fn recognise(folder: &Path) -> bool {
 pub(super) fn open(folder: &Path) -> Result<Sequence, SequenceError> {
     let path = folder.join(FILE);
     let content = |what: String| SequenceError::Content { path: path.clone(), what };
-    let file: TransformsFile = read_json(&path)?;
-    let lens = file.lens().map_err(content)?;
-    let opengl_from_camera = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI);
+    let Transforms { lens, photos } = Transforms::parse(&read_text(&path)?, &path)?;
     let (mut entries, mut poses) = (Vec::new(), Vec::new());
-    for (index, frame) in file.frames.iter().enumerate() {
-        let in_frame = |what: String| content(format!("frame {index}, {}: {what}", frame.file_path));
-        let color = photo(folder, &frame.file_path)
-            .ok_or_else(|| in_frame("there is no such file; check that the recording was copied whole".into()))?;
-        let world_from_opengl = checks::rigid(frame.transform_matrix.as_flattened()).map_err(in_frame)?;
+    for (index, (file_path, world_from_camera)) in photos.into_iter().enumerate() {
         let timestamp_s = index as f64;
+        let color = photo(folder, &file_path).ok_or_else(|| {
+            content(format!("frame {index}, {file_path}: there is no such file; check that the recording was copied whole"))
+        })?;
         entries.push(FrameEntry { timestamp_s, color, depth: None, right: None });
-        poses.push(StampedPose { timestamp_s, world_from_camera: world_from_opengl * opengl_from_camera });
+        poses.push(StampedPose { timestamp_s, world_from_camera });
     }
     let first = &entries.first().ok_or_else(|| SequenceError::Empty { path: path.clone() })?.color;
     let size = image::image_dimensions(first).map_err(|source| SequenceError::Image { path: first.clone(), source })?;
@@ -47,6 +44,29 @@ pub(super) fn open(folder: &Path) -> Result<Sequence, SequenceError> {
     let sequence = Sequence { groundtruth, ..Sequence::new(name, Layout::Transforms, camera, Sensor::Mono, entries) };
     sequence.check_first_size()?;
     Ok(sequence)
+}
+
+/// What the file says, checked.
+pub(super) struct Transforms {
+    pub lens: Lens,
+    /// Each photo's path as it is written, and world_from_camera.
+    pub photos: Vec<(String, Se3)>,
+}
+
+impl Transforms {
+    /// `path` is named in errors.
+    pub fn parse(text: &str, path: &Path) -> Result<Self, SequenceError> {
+        let content = |what: String| SequenceError::Content { path: path.into(), what };
+        let file: TransformsFile = parse_json(text, path)?;
+        let lens = file.lens().map_err(content)?;
+        let opengl_from_camera = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI);
+        let pose = |(index, frame): (usize, ListedFrame)| {
+            let world_from_opengl = checks::rigid(frame.transform_matrix.as_flattened())
+                .map_err(|what| content(format!("frame {index}, {}: {what}", frame.file_path)))?;
+            Ok::<_, SequenceError>((frame.file_path, world_from_opengl * opengl_from_camera))
+        };
+        Ok(Self { lens, photos: file.frames.into_iter().enumerate().map(pose).collect::<Result<_, SequenceError>>()? })
+    }
 }
 
 /// The photo that a path means.
@@ -75,7 +95,7 @@ struct ListedFrame {
 /// Pixels, and radians across the whole image.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Deserialize)]
 #[serde(default)]
-struct Lens {
+pub(super) struct Lens {
     camera_angle_x: Option<f64>,
     camera_angle_y: Option<f64>,
     fl_x: Option<f64>,
@@ -116,7 +136,7 @@ impl Lens {
     }
 
     /// The camera of photos of that size, if it does not say its own.
-    fn camera(&self, (width, height): (u32, u32)) -> Result<Camera, String> {
+    pub fn camera(&self, (width, height): (u32, u32)) -> Result<Camera, String> {
         let (w, h) = (self.w.unwrap_or(f64::from(width)), self.h.unwrap_or(f64::from(height)));
         let side = |pixels: f64| {
             let whole = (pixels.fract() == 0.0 && pixels > 0.0).then_some(pixels as u64);

@@ -5,7 +5,7 @@
 
 use std::path::{Path, PathBuf};
 
-use super::{FrameEntry, Layout, Sensor, Sequence, SequenceError, cameras, folder_name};
+use super::{FrameEntry, Layout, Sensor, Sequence, SequenceError, cameras, folder_name, read_text};
 use crate::geometry::{Camera, Distortion, Pinhole, Trajectory};
 
 /// Colour and depth further apart than this do not belong together (half a frame at 30 Hz, rounded up as the benchmark's tools do).
@@ -16,11 +16,17 @@ struct ListedImage {
     path: PathBuf,
 }
 
+/// A line of a list: its number, its time in seconds, its file.
+type Listed<'a> = (usize, f64, &'a str);
+
 pub(super) fn open(folder: &Path, camera: Option<&str>) -> Result<Sequence, SequenceError> {
     let name = folder_name(folder);
     let camera = match camera {
         Some(preset) => cameras::by_name(preset)?,
-        None if folder.join("camera.txt").is_file() => read_camera(&folder.join("camera.txt"))?,
+        None if folder.join("camera.txt").is_file() => {
+            let path = folder.join("camera.txt");
+            parse_camera(&read_text(&path)?, &path)?
+        }
         None => cameras::by_folder(&name).ok_or_else(|| SequenceError::NoCamera { folder: folder.into() })?,
     };
     let colors = read_list(folder, "rgb.txt")?;
@@ -55,14 +61,24 @@ fn pair(colors: Vec<ListedImage>, depths: &[ListedImage]) -> Vec<FrameEntry> {
         .collect()
 }
 
-/// Reads a list `timestamp file`, checked: finite ascending times, existing files, at least one.
+/// Reads a list, checked: see [`parse_list`], and its files are there.
 fn read_list(folder: &Path, list_name: &str) -> Result<Vec<ListedImage>, SequenceError> {
     let list = folder.join(list_name);
-    let text = std::fs::read_to_string(&list).map_err(|source| SequenceError::Read { path: list.clone(), source })?;
-    let mut images: Vec<ListedImage> = Vec::new();
+    let text = read_text(&list)?;
+    let listed = |(line, timestamp_s, file): Listed<'_>| {
+        let path = folder.join(file);
+        let missing = |image| SequenceError::MissingImage { list: list.clone(), line, image };
+        if path.is_file() { Ok(ListedImage { timestamp_s, path }) } else { Err(missing(path)) }
+    };
+    parse_list(&text, &list)?.into_iter().map(listed).collect()
+}
+
+/// The lines `timestamp file` of a list: finite ascending times, at least one. `list` is named in errors.
+pub(super) fn parse_list<'a>(text: &'a str, list: &Path) -> Result<Vec<Listed<'a>>, SequenceError> {
+    let mut images: Vec<Listed<'_>> = Vec::new();
     for (index, raw) in text.lines().enumerate() {
         let line = index + 1;
-        let syntax = |what: String| SequenceError::Syntax { path: list.clone(), line, what };
+        let syntax = |what: String| SequenceError::Syntax { path: list.into(), line, what };
         let content = raw.split('#').next().unwrap_or_default().trim();
         if content.is_empty() {
             continue;
@@ -73,25 +89,21 @@ fn read_list(folder: &Path, list_name: &str) -> Result<Vec<ListedImage>, Sequenc
         if !timestamp_s.is_finite() {
             return Err(syntax(format!("the timestamp `{time}` is not finite")));
         }
-        if images.last().is_some_and(|last| timestamp_s <= last.timestamp_s) {
+        if images.last().is_some_and(|(_, last_s, _)| timestamp_s <= *last_s) {
             return Err(syntax(format!(
                 "the timestamp {time} is not after the one before it; sort the list by time and drop duplicates"
             )));
         }
-        let image = folder.join(file.trim());
-        if !image.is_file() {
-            return Err(SequenceError::MissingImage { list, line, image });
-        }
-        images.push(ListedImage { timestamp_s, path: image });
+        images.push((line, timestamp_s, file.trim()));
     }
     if images.is_empty() {
-        return Err(SequenceError::Empty { path: list });
+        return Err(SequenceError::Empty { path: list.into() });
     }
     Ok(images)
 }
 
-fn read_camera(path: &Path) -> Result<Camera, SequenceError> {
-    let text = std::fs::read_to_string(path).map_err(|source| SequenceError::Read { path: path.into(), source })?;
+/// The camera of a `camera.txt`; `path` is named in errors.
+pub(super) fn parse_camera(text: &str, path: &Path) -> Result<Camera, SequenceError> {
     let found = text.lines().enumerate().find(|(_, l)| !l.trim().is_empty() && !l.trim_start().starts_with('#'));
     let (index, content) = found.ok_or_else(|| SequenceError::Empty { path: path.into() })?;
     let syntax = |what: String| SequenceError::Syntax { path: path.into(), line: index + 1, what };

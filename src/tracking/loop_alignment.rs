@@ -2,7 +2,9 @@
 //! form), then Levenberg-Marquardt over the reprojections in both images (Mur-Artal & Tardós, *Visual-inertial monocular SLAM with map
 //! reuse*, 2017, sec. on Sim(3); ours also weighs measured depths).
 //!
-//! SE(3) where the sensor knows the scale: then the scale stays 1. The random numbers have a fixed seed.
+//! SE(3) where the sensor knows the scale: then the scale stays 1. Where it does not, reprojections alone say nothing of the scale if both
+//! keyframes stand in one place, as they do where a loop closes: there the points' own distances count as weakly measured ones.
+//! The random numbers have a fixed seed.
 
 use nalgebra::{Matrix3, Point3, SMatrix, Vector3};
 
@@ -22,6 +24,9 @@ const MISSED: f64 = 1e-3;
 const ROUGH_FACTOR: f64 = 3.0;
 /// Fewer pairs than this agree by chance.
 const MIN_INLIERS: usize = 12;
+/// Standard deviation of the distance at which a keyframe without depth believes a point, as a share of it. Common errors of all points are
+/// the scale that is looked for; this is what remains of each.
+const KNOWN_DISTANCE_SIGMA: f64 = 0.1;
 const ROUNDS: usize = 3;
 const STEPS_PER_ROUND: usize = 6;
 
@@ -37,9 +42,10 @@ pub struct Pair {
 /// a_from_b, the motion between two keyframes; `None` if too few pairs agree on one in both images.
 pub fn align_pairs(pairs: &[Pair], pinhole: &Pinhole, scale_is_free: bool) -> Option<Sim3> {
     let mut a_from_b = draw_best(pairs, pinhole, scale_is_free)?;
+    let pairs: Vec<Pair> = pairs.iter().map(|pair| if scale_is_free { pair.with_known_distances() } else { *pair }).collect();
     for _ in 0..ROUNDS {
         let trusts: Vec<[Trust; 2]> = pairs.iter().map(|pair| pair.judge(pinhole, &a_from_b)).collect();
-        a_from_b = refine(pairs, &trusts, pinhole, &a_from_b, scale_is_free);
+        a_from_b = refine(&pairs, &trusts, pinhole, &a_from_b, scale_is_free);
     }
     let inliers = pairs.iter().filter(|pair| agrees(&pair.judge(pinhole, &a_from_b))).count();
     (inliers >= MIN_INLIERS).then_some(a_from_b)
@@ -127,6 +133,15 @@ impl Pair {
         let in_a = self.in_a.judge(pinhole, &a_from_b.act(&self.p_in_b).coords);
         let in_b = self.in_b.judge(pinhole, &a_from_b.inverse().act(&self.p_in_a).coords);
         [in_a, in_b]
+    }
+
+    /// The same, with what the keyframes believe of the point's depth as measured where nothing is.
+    fn with_known_distances(&self) -> Self {
+        let known = |m: Measurement, depth: f64| match m.inverse_depth {
+            Some(_) => m,
+            None => Measurement { inverse_depth: Some(1.0 / depth), depth_weight: depth / KNOWN_DISTANCE_SIGMA, ..m },
+        };
+        Self { in_a: known(self.in_a, self.p_in_a.z), in_b: known(self.in_b, self.p_in_b.z), ..*self }
     }
 
     /// The same, with larger errors allowed.

@@ -46,6 +46,17 @@ pub use error::TrackingError;
 pub use relative_pose::PoseMeasurement;
 pub use tracker::Tracker;
 
+/// The solvers behind the tracker, for whoever tries them alone.
+pub(crate) mod solvers {
+    pub use super::bundle::{BundleObservation, BundleProblem};
+    pub use super::initialise::two_views;
+    pub use super::loop_alignment::{Pair, align_pairs};
+    pub use super::measurement::{Measurement, Trust};
+    pub use super::pose::{PoseObservation, optimise_pose};
+    pub use super::pose_graph::{Edge, PoseGraph};
+    pub use super::triangulate::{View, triangulate};
+}
+
 use nalgebra::Vector2;
 use serde::{Deserialize, Serialize};
 

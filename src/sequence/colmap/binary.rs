@@ -4,7 +4,7 @@
 //! the file, so that a damaged header allocates nothing.
 
 use std::fs::File;
-use std::io::{BufReader, Read};
+use std::io::{BufReader, Read, Seek};
 use std::path::{Path, PathBuf};
 
 use super::{KnownImage, MODELS, ModelCamera};
@@ -20,8 +20,7 @@ const LEAST_POINT: u64 = 8 + 3 * 8 + 3 + 8 + 8;
 const OBSERVATION: u64 = 2 * 8 + 8;
 const TRACK_ELEMENT: u64 = 4 + 4;
 
-pub fn cameras(path: &Path) -> Result<Vec<ModelCamera>, SequenceError> {
-    let mut file = Records::open(path)?;
+pub fn cameras(mut file: Records<impl Read + Seek>) -> Result<Vec<ModelCamera>, SequenceError> {
     let count = file.count(LEAST_CAMERA)?;
     let mut cameras = Vec::with_capacity(count);
     for _ in 0..count {
@@ -35,8 +34,7 @@ pub fn cameras(path: &Path) -> Result<Vec<ModelCamera>, SequenceError> {
     Ok(cameras)
 }
 
-pub fn images(path: &Path) -> Result<Vec<KnownImage>, SequenceError> {
-    let mut file = Records::open(path)?;
+pub fn images(mut file: Records<impl Read + Seek>) -> Result<Vec<KnownImage>, SequenceError> {
     let count = file.count(LEAST_IMAGE)?;
     let mut images = Vec::with_capacity(count);
     for _ in 0..count {
@@ -48,14 +46,13 @@ pub fn images(path: &Path) -> Result<Vec<KnownImage>, SequenceError> {
         let observations = file.count(OBSERVATION)? as u64;
         file.skip(observations * OBSERVATION)?;
         let camera_from_world = checks::rigid_of_quaternion(translation, quaternion)
-            .map_err(|what| SequenceError::Content { path: path.into(), what: format!("{name}: {what}") })?;
+            .map_err(|what| SequenceError::Content { path: file.path.clone(), what: format!("{name}: {what}") })?;
         images.push(KnownImage { name, camera, camera_from_world });
     }
     Ok(images)
 }
 
-pub fn points(path: &Path) -> Result<Vec<KnownPoint>, SequenceError> {
-    let mut file = Records::open(path)?;
+pub fn points(mut file: Records<impl Read + Seek>) -> Result<Vec<KnownPoint>, SequenceError> {
     let count = file.count(LEAST_POINT)?;
     let mut points = Vec::with_capacity(count);
     for _ in 0..count {
@@ -74,18 +71,25 @@ pub fn points(path: &Path) -> Result<Vec<KnownPoint>, SequenceError> {
 }
 
 /// A file that knows how many bytes are left of it.
-struct Records {
+pub struct Records<R> {
     path: PathBuf,
-    reader: BufReader<File>,
+    reader: BufReader<R>,
     left: u64,
 }
 
-impl Records {
-    fn open(path: &Path) -> Result<Self, SequenceError> {
+impl Records<File> {
+    pub fn open(path: &Path) -> Result<Self, SequenceError> {
         let read_error = |source| SequenceError::Read { path: path.into(), source };
         let file = File::open(path).map_err(read_error)?;
         let left = file.metadata().map_err(read_error)?.len();
-        Ok(Self { path: path.into(), reader: BufReader::new(file), left })
+        Ok(Self::new(file, left, path))
+    }
+}
+
+impl<R: Read + Seek> Records<R> {
+    /// Of `left` bytes; `path` is named in errors.
+    pub fn new(reader: R, left: u64, path: &Path) -> Self {
+        Self { path: path.into(), reader: BufReader::new(reader), left }
     }
 
     fn wrong(&self, what: &str) -> SequenceError {

@@ -6,16 +6,18 @@
 //!
 //! Left out: models of several cameras, and fisheye lenses; both are refused.
 
-mod binary;
-mod text;
+pub(super) mod binary;
+pub(super) mod text;
 
 #[cfg(test)]
 mod tests;
 
+use std::fs::File;
 use std::path::{Path, PathBuf};
 
-use super::{FrameEntry, Layout, Sensor, Sequence, SequenceError, checks, folder_name};
+use super::{FrameEntry, Layout, Sensor, Sequence, SequenceError, checks, folder_name, read_text};
 use crate::geometry::{Camera, Distortion, Pinhole, Se3, StampedPose, Trajectory};
+use binary::Records;
 
 /// COLMAP's camera models in the order of their numbers, with how many parameters each has.
 const MODELS: [(&str, usize); 11] = [
@@ -33,7 +35,7 @@ const MODELS: [(&str, usize); 11] = [
 ];
 
 /// A camera as the model has it.
-struct ModelCamera {
+pub(super) struct ModelCamera {
     id: u32,
     model: String,
     width: u64,
@@ -42,7 +44,7 @@ struct ModelCamera {
 }
 
 /// A photo and where it was taken.
-struct KnownImage {
+pub(super) struct KnownImage {
     /// Path below `images/`.
     name: String,
     /// The number of its camera.
@@ -107,18 +109,19 @@ pub(super) fn open(folder: &Path) -> Result<Sequence, SequenceError> {
 fn read<T>(
     model: &Path,
     part: &str,
-    binary: impl Fn(&Path) -> Result<T, SequenceError>,
-    text: impl Fn(&Path) -> Result<T, SequenceError>,
+    binary: impl Fn(Records<File>) -> Result<T, SequenceError>,
+    text: impl Fn(&str, &Path) -> Result<T, SequenceError>,
 ) -> Result<(T, PathBuf), SequenceError> {
     let path = model.join(format!("{part}.bin"));
     if path.is_file() {
-        return Ok((binary(&path)?, path));
+        return Ok((binary(Records::open(&path)?)?, path));
     }
     let path = model.join(format!("{part}.txt"));
-    Ok((text(&path)?, path))
+    Ok((text(&read_text(&path)?, &path)?, path))
 }
 
-fn camera_of(camera: &ModelCamera) -> Result<Camera, String> {
+/// The camera, if its model is one that we know.
+pub(super) fn camera_of(camera: &ModelCamera) -> Result<Camera, String> {
     let model = camera.model.as_str();
     let (fx, fy, cx, cy, [k1, k2, p1, p2]) = match (model, camera.parameters.as_slice()) {
         ("SIMPLE_PINHOLE", &[f, cx, cy]) => (f, f, cx, cy, [0.0; 4]),

@@ -1,13 +1,14 @@
 //! COLMAP's text models: one record a line, `#` begins a comment; an image has a second line, its observations, which may be empty.
+//! Paths are named in errors.
 
 use std::path::Path;
 
 use super::{KnownImage, ModelCamera};
-use crate::sequence::{KnownPoint, SequenceError, checks, read_text};
+use crate::sequence::{KnownPoint, SequenceError, checks};
 
 /// `CAMERA_ID MODEL WIDTH HEIGHT PARAMS…`
-pub fn cameras(path: &Path) -> Result<Vec<ModelCamera>, SequenceError> {
-    records(path, 1, |line| {
+pub fn cameras(text: &str, path: &Path) -> Result<Vec<ModelCamera>, SequenceError> {
+    records(text, path, 1, |line| {
         let mut fields = line.split_whitespace();
         let id = parse(fields.next(), "camera's number")?;
         let model = fields.next().ok_or("there is no camera model")?.to_owned();
@@ -18,8 +19,8 @@ pub fn cameras(path: &Path) -> Result<Vec<ModelCamera>, SequenceError> {
 }
 
 /// `IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME`, then a line of observations.
-pub fn images(path: &Path) -> Result<Vec<KnownImage>, SequenceError> {
-    records(path, 2, |line| {
+pub fn images(text: &str, path: &Path) -> Result<Vec<KnownImage>, SequenceError> {
+    records(text, path, 2, |line| {
         // The name is the rest of the line: it may have spaces.
         let mut rest = line;
         let mut field = || {
@@ -43,8 +44,8 @@ pub fn images(path: &Path) -> Result<Vec<KnownImage>, SequenceError> {
 }
 
 /// `POINT3D_ID X Y Z R G B ERROR TRACK…`
-pub fn points(path: &Path) -> Result<Vec<KnownPoint>, SequenceError> {
-    records(path, 1, |line| {
+pub fn points(text: &str, path: &Path) -> Result<Vec<KnownPoint>, SequenceError> {
+    records(text, path, 1, |line| {
         let mut fields = line.split_whitespace().skip(1);
         let mut position = [0.0; 3];
         for number in &mut position {
@@ -62,8 +63,12 @@ pub fn points(path: &Path) -> Result<Vec<KnownPoint>, SequenceError> {
 }
 
 /// The records that start at every `lines_each`-th line after a comment or blank line.
-fn records<T>(path: &Path, lines_each: usize, read: impl Fn(&str) -> Result<T, String>) -> Result<Vec<T>, SequenceError> {
-    let text = read_text(path)?;
+fn records<T>(
+    text: &str,
+    path: &Path,
+    lines_each: usize,
+    read: impl Fn(&str) -> Result<T, String>,
+) -> Result<Vec<T>, SequenceError> {
     let mut lines = text.lines().enumerate();
     let mut records = Vec::new();
     while let Some((index, line)) = lines.next() {

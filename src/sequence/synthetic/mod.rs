@@ -77,8 +77,13 @@ impl SceneConfig {
     /// Reads and checks a scene file.
     pub fn read(path: &Path) -> Result<Self, SceneError> {
         let text = std::fs::read_to_string(path).map_err(|source| SceneError::Read { path: path.into(), source })?;
+        Self::parse(&text, path)
+    }
+
+    /// The same of a text; `path` is named in errors.
+    pub fn parse(text: &str, path: &Path) -> Result<Self, SceneError> {
         let config: Self =
-            toml::from_str(&text).map_err(|source| SceneError::Syntax { path: path.into(), source: Box::new(source) })?;
+            toml::from_str(text).map_err(|source| SceneError::Syntax { path: path.into(), source: Box::new(source) })?;
         config.validate().map_err(|source| SceneError::In { path: path.into(), source: Box::new(source) })?;
         Ok(config)
     }

@@ -3,9 +3,7 @@
 //! Decoders open nearly anything, a picture as a video of one frame, text as a terminal's screen. Here only the containers that cameras
 //! write are let through: MP4 and QuickTime (ISO/IEC 14496-12), AVI (RIFF), Matroska and WebM (RFC 8794 has their first bytes).
 
-use std::fs::File;
 use std::io::{self, Read, Seek, SeekFrom};
-use std::path::Path;
 
 /// How the bytes of a video are wrapped.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -23,9 +21,9 @@ const FIRST_BOXES: [&[u8]; 6] = [b"ftyp", b"moov", b"mdat", b"wide", b"free", b"
 
 impl Container {
     /// The container of a file, `None` where it is none of those that we know.
-    pub fn of(path: &Path) -> io::Result<Option<Self>> {
+    pub fn of(file: impl Read) -> io::Result<Option<Self>> {
         let mut head = Vec::with_capacity(12);
-        File::open(path)?.take(12).read_to_end(&mut head)?;
+        file.take(12).read_to_end(&mut head)?;
         let part = |range: std::ops::Range<usize>| head.get(range).unwrap_or_default();
         Ok(if FIRST_BOXES.contains(&part(4..8)) {
             Some(Self::Boxes)
@@ -39,14 +37,13 @@ impl Container {
     }
 
     /// Whether the file ends before its container says that it does. Matroska, which may leave lengths open, is never found cut.
-    pub fn is_cut(self, path: &Path) -> io::Result<bool> {
-        let mut file = File::open(path)?;
-        let length = file.metadata()?.len();
+    pub fn is_cut(self, mut file: impl Read + Seek) -> io::Result<bool> {
+        let length = file.seek(SeekFrom::End(0))?;
         let mut at = 0u64;
         while at < length {
             file.seek(SeekFrom::Start(at))?;
             let mut head = [0; 16];
-            if io::copy(&mut (&file).take(16), &mut head.as_mut_slice())? < 8 {
+            if io::copy(&mut (&mut file).take(16), &mut head.as_mut_slice())? < 8 {
                 return Ok(false);
             }
             match self.part_length(&head) {
@@ -79,10 +76,8 @@ mod tests {
 
     /// What is found of a file with these bytes: its container, and whether it is cut.
     fn found(bytes: &[u8]) -> Option<(Container, bool)> {
-        let file = tempfile::NamedTempFile::new().unwrap();
-        std::fs::write(file.path(), bytes).unwrap();
-        let container = Container::of(file.path()).unwrap()?;
-        Some((container, container.is_cut(file.path()).unwrap()))
+        let container = Container::of(bytes).unwrap()?;
+        Some((container, container.is_cut(io::Cursor::new(bytes)).unwrap()))
     }
 
     #[test]

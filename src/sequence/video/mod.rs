@@ -6,17 +6,18 @@
 //! Opening decodes the video once, for the times of its frames: containers count wrongly, phones film at no steady rate, and `decoder`
 //! never seeks. Frames then come in order at the cost of decoding; going back begins at the first frame again.
 
-mod container;
+pub(super) mod container;
 mod decoder;
 #[cfg(test)]
 mod tests;
 
+use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use image::RgbImage;
 
-use super::{FrameEntry, Layout, Sensor, Sequence, SequenceError, cameras, files_in, images, images_in};
+use super::{FrameEntry, Layout, Sensor, Sequence, SequenceError, cameras, files_in, images, images_in, read_text};
 use crate::geometry::Camera;
 use container::Container;
 use decoder::Decoder;
@@ -38,11 +39,12 @@ pub(super) fn recognise(folder: &Path) -> bool {
 pub(super) fn open(path: &Path, camera: Option<&str>) -> Result<Sequence, SequenceError> {
     let path = if path.is_dir() { only_video_in(path)? } else { path.into() };
     let read_error = |source| SequenceError::Read { path: path.clone(), source };
-    let container = Container::of(&path).map_err(read_error)?.ok_or_else(|| SequenceError::NoVideo { path: path.clone() })?;
+    let mut file = File::open(&path).map_err(read_error)?;
+    let container = Container::of(&file).map_err(read_error)?.ok_or_else(|| SequenceError::NoVideo { path: path.clone() })?;
     let (camera, usual_fps) = camera_of(&path, camera)?;
     let name = path.file_stem().map_or_else(|| "video".into(), |stem| stem.to_string_lossy().into_owned());
     let mut sequence = Sequence::new(name, Layout::Video, camera, Sensor::Mono, Vec::new());
-    let is_cut = container.is_cut(&path).map_err(read_error)?;
+    let is_cut = container.is_cut(&mut file).map_err(read_error)?;
     let check_size = |(width, height)| {
         if (height, width) == (camera.pinhole.width, camera.pinhole.height) && width != height {
             let what = format!("was filmed as {width}x{height}, whichever way players turn it; calibrate the camera for that");
@@ -78,7 +80,7 @@ fn camera_of(video: &Path, named: Option<&str>) -> Result<(Camera, f64), Sequenc
         let what = "there is no camera.toml beside this video; write one with fps and pinhole, or name one with --camera";
         return Err(SequenceError::Content { path: video.into(), what: what.into() });
     }
-    let (camera, file) = images::read_camera(&path)?;
+    let (camera, file) = images::parse_camera(&read_text(&path)?, &path)?;
     if file.stereo.is_some() {
         let what = "a video is of one camera: remove [stereo], or make folders left and right of its frames";
         return Err(SequenceError::Content { path, what: what.into() });

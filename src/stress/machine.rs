@@ -1,0 +1,45 @@
+//! The adapter with what runs on it, shared by all families.
+
+use std::cell::RefCell;
+use std::sync::Arc;
+
+use crate::gpu::{Gpu, GpuError};
+use crate::optimise::Optimiser;
+use crate::render::{BlendForm, GpuCloud, Rasterizer};
+use crate::splat::GaussianCloud;
+
+/// A rasterizer of each form of the blending passes, with its optimiser.
+#[derive(Debug)]
+pub struct Machine {
+    pub gpu: Arc<Gpu>,
+    forms: [RefCell<(Rasterizer, Optimiser)>; 2],
+}
+
+impl Machine {
+    /// On the adapter whose name contains `adapter`, or on the fastest.
+    ///
+    /// # Errors
+    /// [`GpuError`] if there is none.
+    pub fn open(adapter: Option<&str>) -> Result<Self, GpuError> {
+        let gpu = Gpu::open(adapter)?;
+        let form = |form| -> Result<_, GpuError> {
+            let rasterizer = Rasterizer::with_form(gpu.clone(), form)?;
+            let optimiser = Optimiser::new(&rasterizer)?;
+            Ok(RefCell::new((rasterizer, optimiser)))
+        };
+        let [first, second] = BlendForm::ALL;
+        Ok(Self { forms: [form(first)?, form(second)?], gpu })
+    }
+
+    /// Runs on one of the two forms.
+    pub(super) fn with<T>(&self, form: usize, work: impl FnOnce(&mut Rasterizer, &mut Optimiser) -> T) -> T {
+        let (rasterizer, optimiser) = &mut *self.forms[form % 2].borrow_mut();
+        work(rasterizer, optimiser)
+    }
+
+    pub(super) fn upload(&self, cloud: &GaussianCloud) -> Result<GpuCloud, GpuError> {
+        let mut on_gpu = GpuCloud::new(&self.gpu, cloud.sh_degree, cloud.len())?;
+        on_gpu.append(&self.gpu, cloud)?;
+        Ok(on_gpu)
+    }
+}

@@ -1,0 +1,152 @@
+//! Damaged, cut and lying files: every parser says what is wrong, in bounded memory, and never panics. The seeds are those of the fuzz
+//! targets (`fuzz/corpus`); here they are damaged by seeded chance, there by what covers more code.
+
+use std::alloc::{GlobalAlloc, Layout as Memory, System};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use fastrand::Rng;
+use keysplat::config::Config;
+use keysplat::export::ply;
+use keysplat::geometry::Trajectory;
+use keysplat::sequence::Layout;
+use keysplat::sequence::synthetic::SceneConfig;
+
+/// Counts the bytes in use, and the most that ever were.
+struct Counting;
+
+static USED: AtomicUsize = AtomicUsize::new(0);
+static PEAK: AtomicUsize = AtomicUsize::new(0);
+
+// SAFETY: everything is passed on to the system's allocator.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, memory: Memory) -> *mut u8 {
+        PEAK.fetch_max(USED.fetch_add(memory.size(), Ordering::Relaxed) + memory.size(), Ordering::Relaxed);
+        unsafe { System.alloc(memory) }
+    }
+
+    unsafe fn dealloc(&self, at: *mut u8, memory: Memory) {
+        USED.fetch_sub(memory.size(), Ordering::Relaxed);
+        unsafe { System.dealloc(at, memory) }
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: Counting = Counting;
+
+/// More than any of these files may need; the YAML reader gives up on aliases of aliases after some 90 MB.
+const MOST_BYTES: usize = 128 << 20;
+const DAMAGED_EACH: usize = 400;
+
+/// The parsers of a target: how many of them took the bytes.
+fn parse(target: &str, bytes: &[u8]) -> usize {
+    let path = Path::new("file");
+    let text = || std::str::from_utf8(bytes).ok();
+    let layout = Layout::ALL.into_iter().find(|layout| format!("{layout:?}").eq_ignore_ascii_case(target));
+    match (layout, target) {
+        (Some(layout), _) => layout.parse_files(bytes).iter().filter(|result| result.is_ok()).count(),
+        (_, "ply") => usize::from(ply::read_from(bytes, bytes.len() as u64, path).is_ok()),
+        (_, "trajectory") => usize::from(text().is_some_and(|text| Trajectory::parse_tum(text, path).is_ok())),
+        (_, "config") => usize::from(text().is_some_and(|text| Config::parse(text, path, false).is_ok())),
+        (_, "scene") => usize::from(text().is_some_and(|text| SceneConfig::parse(text, path).is_ok())),
+        _ => panic!("the corpus {target} has no parser here"),
+    }
+}
+
+/// `(target, file, bytes)` of the whole corpus.
+fn corpus() -> Vec<(String, PathBuf, Vec<u8>)> {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("fuzz/corpus");
+    let entries = |folder: &Path| -> Vec<PathBuf> {
+        let mut paths: Vec<_> = std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect();
+        paths.sort();
+        paths
+    };
+    let of_target = |folder: PathBuf| {
+        let target = folder.file_name().unwrap().to_str().unwrap().to_owned();
+        entries(&folder).into_iter().map(move |file| (target.clone(), file.clone(), std::fs::read(file).unwrap()))
+    };
+    entries(&root).into_iter().flat_map(of_target).collect()
+}
+
+/// A copy with some bytes changed, lost, doubled, or replaced by numbers that lie.
+fn damaged(rng: &mut Rng, bytes: &[u8]) -> Vec<u8> {
+    const LIES: [&[u8]; 8] = [b"nan", b"-1", b"1e999", b"18446744073709551615", b"[[[[", b"\xff", b"\n", &[0xff; 8]];
+    let mut bytes = bytes.to_vec();
+    for _ in 0..rng.usize(1..6) {
+        let at = rng.usize(..=bytes.len());
+        let end = (at + rng.usize(..12)).min(bytes.len());
+        match rng.usize(..5) {
+            0 => bytes.truncate(at),
+            1 => bytes[at..end].iter_mut().for_each(|byte| *byte ^= 1 << rng.u8(..8)),
+            2 => drop(bytes.drain(at..end)),
+            3 => drop(bytes.splice(at..end, LIES[rng.usize(..LIES.len())].iter().copied())),
+            _ => {
+                let twice = bytes[at..end].repeat(2);
+                drop(bytes.splice(at..end, twice));
+            }
+        }
+    }
+    bytes
+}
+
+fn assert_bounded(what: &str) {
+    let peak = PEAK.load(Ordering::Relaxed);
+    assert!(peak < MOST_BYTES, "{what} took {peak} bytes");
+}
+
+#[test]
+fn the_corpus_is_read_and_its_damaged_copies_do_no_harm() {
+    let corpus = corpus();
+    assert!(
+        Layout::ALL.iter().all(|layout| corpus.iter().any(|(target, ..)| format!("{layout:?}").eq_ignore_ascii_case(target)))
+    );
+    for (target, file, bytes) in corpus {
+        assert!(parse(&target, &bytes) > 0, "{} is read by no parser", file.display());
+        let mut rng = Rng::with_seed(bytes.len() as u64);
+        for _ in 0..DAMAGED_EACH {
+            parse(&target, &damaged(&mut rng, &bytes));
+        }
+        assert_bounded(&file.display().to_string());
+    }
+}
+
+#[test]
+fn lying_headers_cost_no_memory() {
+    let names = [
+        "x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2",
+        "rot_3",
+    ];
+    let properties: String = names.iter().map(|name| format!("property float {name}\n")).collect();
+    for count in [1u64 << 40, 1 << 58, u64::MAX] {
+        let header = format!("ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}end_header\n");
+        assert_eq!(parse("ply", &[header.as_bytes(), &[0; 4096]].concat()), 0);
+        let model = [&count.to_le_bytes()[..], &[1; 4096]].concat();
+        assert_eq!(parse("colmap", &model), 0);
+        let mut atom = [0u8, 0, 0, 1, b'f', b't', b'y', b'p'].to_vec();
+        atom.extend(count.to_be_bytes());
+        assert_eq!(parse("video", &atom), 1, "it is a video, and known to be cut");
+    }
+    assert_bounded("a lying header");
+}
+
+#[test]
+fn deep_nesting_and_endless_aliases_are_refused() {
+    let deep = |open: &str| open.repeat(10_000);
+    for target in ["transforms", "replica"] {
+        assert_eq!(parse(target, deep("[").as_bytes()), 0);
+        assert_eq!(parse(target, deep("{\"a\":").as_bytes()), 0);
+    }
+    for target in ["config", "images", "scene"] {
+        assert_eq!(parse(target, format!("a = {}", deep("[")).as_bytes()), 0);
+        assert_eq!(parse(target, format!("a = {}", deep("{b=")).as_bytes()), 0);
+        assert_eq!(parse(target, format!("{} = 1", deep("a.")).as_bytes()), 0);
+    }
+    assert_eq!(parse("euroc", deep("[").as_bytes()), 0);
+    assert_eq!(parse("euroc", deep("- ").as_bytes()), 0);
+    let mut aliases = String::from("a0: &a0 [1]\n");
+    for i in 1..30 {
+        aliases += &format!("a{i}: &a{i} [{}]\n", vec![format!("*a{}", i - 1); 10].join(", "));
+    }
+    assert_eq!(parse("euroc", aliases.as_bytes()), 0);
+    assert_bounded("nesting");
+}
