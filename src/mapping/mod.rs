@@ -17,5 +17,5 @@ pub use config::{MappingConfig, PointsConfig, RefineConfig, SeedingConfig, SkipC
 pub use density::{ClassicConfig, DensityConfig, DensityStrategy, VcdConfig};
 pub use keyframe::{Keyframe, KeyframeId};
 pub use limits::LimitsConfig;
-pub use mapper::{KeyframeReport, Mapper, MappingError, RefineReport, Refinement};
+pub use mapper::{KeyframeReport, Mapper, MapperState, MappingError, RefineReport, Refinement};
 pub use refine_poses::{RefinePosesConfig, RefinedPair};
