@@ -31,17 +31,17 @@ began=$(now)
 whole_ms=$((($(now) - began) / 1000000))
 expected=$(hashes "$work/whole")
 echo "unbroken: $whole_ms ms, trajectory and map $expected"
-printf '%4s  %-24s  %10s  %s\n' run 'killed after, ms' checkpoint 'trajectory and map'
+printf '%4s %6s %10s  %-25s  %-7s  %s\n' run kills checkpoint 'trajectory and map' '' 'killed after, ms'
 failed=0
 for i in $(seq "$count"); do
-    out=$work/run moments='' size=none
+    out=$work/run moments=() size=none
     rm -rf "$out"
     command=("$keysplat" -q run "$recording" --out "$out" --checkpoint-every "$every" "$@")
     # Each resumed run may be killed too, every second one is.
     while :; do
         ms=$((RANDOM * RANDOM % whole_ms))
         killed_after "$ms" "${command[@]}" || break
-        moments+=" $ms"
+        moments+=("$ms")
         if [ -e "$out/checkpoint.bin" ]; then
             size=$(stat -c %s "$out/checkpoint.bin")
             command=("$keysplat" -q resume "$out")
@@ -54,6 +54,6 @@ for i in $(seq "$count"); do
     found=$(hashes "$out" 2>/dev/null || echo 'no result')
     verdict=same
     [ "$found" = "$expected" ] && [ ! -e "$out/checkpoint.bin" ] || { verdict='DIFFERS' && failed=1; }
-    printf '%4d %-25s  %10s  %s %s\n' "$i" "${moments:- -}" "$size" "$found" "$verdict"
+    printf '%4d %6d %10s  %-25s  %-7s  %s\n' "$i" "${#moments[@]}" "$size" "$found" "$verdict" "${moments[*]}"
 done
 [ "$failed" -eq 0 ] || { cat "$work/log" >&2; exit 1; }

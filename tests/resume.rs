@@ -84,7 +84,7 @@ fn assert_same_run(a: &Path, b: &Path) {
         keyframes
             .into_iter()
             .map(|mut keyframe| {
-                ["done_s", "busy_s", "waiting"].map(|time| keyframe[time].take());
+                ["done_s", "busy_s", "waiting"].iter().for_each(|time| keyframe[*time] = 0.into());
                 keyframe
             })
             .collect::<Vec<_>>()
@@ -99,12 +99,12 @@ fn assert_same_run(a: &Path, b: &Path) {
 }
 
 /// Killed between two checkpoints, again while it catches up, and again later, the run ends as it would have.
-fn survives(name: &str, more: &[&str]) {
+fn survives(name: &str, more: &[&str], checkpoints: usize) {
     let whole = unbroken(&format!("{name}-whole"), recording(), more);
     let out = scratch().join(name);
-    killed(keeping(recording(), &out, more), &out, (3, 20));
+    killed(keeping(recording(), &out, more), &out, (checkpoints, 20));
     killed(resume(&out), &out, (0, 400));
-    killed(resume(&out), &out, (4, 0));
+    killed(resume(&out), &out, (2, 0));
     let said = finish(resume(&out)).succeeded();
     assert!(said.stderr.contains("caught up with the checkpoint"), "{}", said.stderr);
     assert_same_run(&out, &whole);
@@ -113,16 +113,21 @@ fn survives(name: &str, more: &[&str]) {
 #[test]
 fn a_killed_run_ends_as_the_unbroken_one() {
     if !skipped_without_adapter() {
-        survives("killed", &[]);
+        survives("killed", &[], 3);
     }
 }
 
-/// The mapper then talks back to the tracker, and counts every byte that it uses.
+/// The mapper then talks back to the tracker, counts every byte that it uses, and has given images back.
 #[test]
 fn what_the_tracker_was_told_and_what_memory_allows_comes_again() {
-    if !skipped_without_adapter() {
-        survives("told", &["--set", "mapping.refine_poses.enabled=true", "--max-gpu-memory", "40M"]);
+    if skipped_without_adapter() {
+        return;
     }
+    let settings = ["tracking.keyframe_translation=0.005", "mapping.refine_poses.enabled=true", "mapping.limits.max_keyframes=8"];
+    let more: Vec<&str> = settings.iter().flat_map(|s| ["--set", s]).chain(["--max-gpu-memory", "20M"]).collect();
+    survives("told", &more, 11);
+    let whole = metrics(&scratch().join("told-whole"));
+    assert!(whole.keyframes > Some(12) && whole.gaussians < Some(4000), "neither limit matters: {whole}");
 }
 
 #[test]

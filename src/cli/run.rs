@@ -230,13 +230,13 @@ pub fn replay(
         return nothing_made(sequence.sensor, error, windows.stopped());
     }
     let finished = write_and_measure((&sequence, config), &gpu, &outcome, &out, verbosity);
+    if error.is_none() && finished.is_ok() && !windows.stopped() {
+        outputs::remove_checkpoint(&out).into_diagnostic()?;
+    } else if config.checkpoint_every.is_some() {
+        tracing::info!("keysplat resume {} goes on from the last checkpoint", out.display());
+    }
     match (error, finished) {
-        (None, Ok(())) if windows.stopped() && config.checkpoint_every.is_some() => {
-            tracing::info!("stopped early; keysplat resume {} goes on", out.display());
-            Ok(())
-        }
-        (None, Ok(())) => outputs::remove_checkpoint(&out).into_diagnostic(),
-        (None, Err(error)) => Err(error),
+        (None, finished) => finished,
         (Some(error), Ok(())) => Err(miette!("{error}\nThe run ended early; what there was until then is in {}", out.display())),
         (Some(error), Err(then)) => Err(miette!("{error}\nThe run ended early, and then: {then}")),
     }

@@ -21,7 +21,8 @@ use crate::gpu::Gpu;
 use crate::mapping::{KeyframeReport, MapperState, RefinedPair};
 use crate::sequence::Sequence;
 
-const MAGIC: &[u8] = b"keysplat checkpoint 1\n";
+/// The first line; only the version that wrote a file knows how to read the rest.
+const HEAD: &str = concat!("keysplat ", env!("CARGO_PKG_VERSION"), " checkpoint\n");
 const DIGEST_BYTES: usize = 32;
 
 #[derive(Debug, thiserror::Error)]
@@ -37,7 +38,6 @@ pub enum CheckpointError {
 /// What a run must share with its checkpoint to go on to the bit.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Identity {
-    version: String,
     /// The whole configuration, TOML.
     config: String,
     adapter: String,
@@ -72,15 +72,10 @@ impl Checkpoint {
     pub fn read(path: &Path) -> Result<Self, CheckpointError> {
         let bytes = std::fs::read(path).map_err(|source| CheckpointError::Read { path: path.into(), source })?;
         let damaged = || CheckpointError::Damaged { path: path.into() };
-        let (digest, rest) =
-            bytes.strip_prefix(MAGIC).and_then(|rest| rest.split_at_checked(DIGEST_BYTES)).ok_or_else(damaged)?;
-        if Sha256::digest(rest).as_slice() != digest {
-            return Err(damaged());
-        }
-        let (identity, rest) = postcard::take_from_bytes::<Identity>(rest).map_err(|_| damaged())?;
-        // Another version may lay the rest out in another way.
-        identity.check_version(path)?;
-        let course = postcard::from_bytes(rest).map_err(|_| damaged())?;
+        check_version(path, &bytes)?;
+        let rest = bytes.strip_prefix(HEAD.as_bytes()).and_then(|rest| rest.split_at_checked(DIGEST_BYTES));
+        let (_, rest) = rest.filter(|(digest, rest)| Sha256::digest(rest).as_slice() == *digest).ok_or_else(damaged)?;
+        let (identity, course) = postcard::from_bytes(rest).map_err(|_| damaged())?;
         Ok(Self { path: path.into(), identity, course })
     }
 
@@ -92,7 +87,7 @@ impl Checkpoint {
     /// Writes one; returns its bytes.
     pub(super) fn write(path: &Path, identity: &Identity, course: Option<&Course>) -> Result<usize, ExportError> {
         let rest = postcard::to_stdvec(&(identity, course)).expect("a checkpoint is plain data");
-        let bytes = [MAGIC, Sha256::digest(&rest).as_slice(), &rest].concat();
+        let bytes = [HEAD.as_bytes(), Sha256::digest(&rest).as_slice(), &rest].concat();
         write_durably(path, &bytes)?;
         Ok(bytes.len())
     }
@@ -120,7 +115,6 @@ impl Identity {
         let times: Vec<f64> = sequence.entries.iter().map(|entry| entry.timestamp_s).collect();
         let recording = format!("{:?} {:?} {times:?}", sequence.camera, sequence.sensor);
         Self {
-            version: env!("CARGO_PKG_VERSION").into(),
             config: config.to_toml(),
             adapter: outputs::adapter(gpu).to_string(),
             frames: times.len(),
@@ -132,14 +126,8 @@ impl Identity {
         toml::from_str(&self.config).ok()
     }
 
-    fn check_version(&self, path: &Path) -> Result<(), CheckpointError> {
-        let advice = "resume with that version, or make the run anew";
-        check(path, ("the version of keysplat", advice), (&self.version.as_str(), &env!("CARGO_PKG_VERSION")))
-    }
-
     /// Says what differs in the run that is to go on from here.
     pub fn check(&self, path: &Path, now: &Self) -> Result<(), CheckpointError> {
-        self.check_version(path)?;
         let settings = |identity: &Self| toml::from_str(&identity.config()?.identity()).ok();
         let tables = settings(self).zip(settings(now)).ok_or_else(|| CheckpointError::Damaged { path: path.into() })?;
         if let Some((setting, then, now)) = difference(&tables.0, &tables.1) {
@@ -150,6 +138,15 @@ impl Identity {
         check(path, ("the number of frames", advice), (&self.frames, &now.frames))?;
         check(path, ("the recording's camera or times (SHA-256)", advice), (&self.recording, &now.recording))
     }
+}
+
+/// Says if another version wrote these bytes; not whether they are a checkpoint at all.
+fn check_version(path: &Path, bytes: &[u8]) -> Result<(), CheckpointError> {
+    let line = bytes.split(|byte| *byte == b'\n').next().and_then(|line| std::str::from_utf8(line).ok());
+    let then = line.and_then(|line| line.strip_prefix("keysplat ")?.strip_suffix(" checkpoint"));
+    let advice = "resume with that version, or make the run anew";
+    let now = env!("CARGO_PKG_VERSION");
+    check(path, ("the version of keysplat", advice), (&then.unwrap_or(now), &now))
 }
 
 fn check<T: Display + PartialEq>(
@@ -183,13 +180,7 @@ mod tests {
     use super::*;
 
     fn identity() -> Identity {
-        Identity {
-            version: env!("CARGO_PKG_VERSION").into(),
-            config: Config::default().to_toml(),
-            adapter: "llvmpipe".into(),
-            frames: 24,
-            recording: "00ff".into(),
-        }
+        Identity { config: Config::default().to_toml(), adapter: "llvmpipe".into(), frames: 24, recording: "00ff".into() }
     }
 
     #[test]
@@ -229,13 +220,17 @@ mod tests {
             assert!(message.contains("checkpoint.bin is damaged or cut off") && message.contains("keysplat run"), "{message}");
         };
         (0..good.len()).step_by(13).for_each(|len| refused(&good[..len]));
-        for at in (0..good.len()).step_by(13) {
+        for at in (HEAD.len()..good.len()).step_by(13).chain([0, HEAD.len() - 1]) {
             let mut bytes = good.clone();
             bytes[at] ^= 4;
             refused(&bytes);
         }
-        // A sound checksum over a count that no file could hold.
-        let rest = [&postcard::to_stdvec(&identity()).unwrap()[..], &[1, 3], &[0; DIGEST_BYTES], &[0xff; 9], &[1]].concat();
-        refused(&[MAGIC, Sha256::digest(&rest).as_slice(), &rest].concat());
+        // A sound checksum over as many Gaussians as no file could hold.
+        let rest =
+            [&postcard::to_stdvec(&identity()).unwrap()[..], &[1, 3], &[0; DIGEST_BYTES], &[8, 0], &[0xff; 9], &[1]].concat();
+        refused(&[HEAD.as_bytes(), Sha256::digest(&rest).as_slice(), &rest].concat());
+        std::fs::write(&path, [&b"keysplat 0.0.7 checkpoint\n"[..], &good[HEAD.len()..]].concat()).unwrap();
+        let message = Checkpoint::read(&path).unwrap_err().to_string();
+        assert!(message.contains("the version of keysplat was 0.0.7 and is ") && message.contains("anew"), "{message}");
     }
 }

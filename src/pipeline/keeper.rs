@@ -1,6 +1,7 @@
 //! Keeps a run's checkpoints as it goes, and goes on from one.
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Instant;
 
 use crossbeam::channel::Receiver;
@@ -13,7 +14,7 @@ use super::{KeyframeRecord, MapperMessage, PipelineError};
 use crate::config::Config;
 use crate::export::ExportError;
 use crate::gpu::Gpu;
-use crate::mapping::{Mapper, MappingConfig, RefinedPair, Refinement};
+use crate::mapping::{Mapper, MappingConfig, MappingError, RefinedPair, Refinement};
 use crate::sequence::Sequence;
 
 /// Where a run's checkpoint lies, and all of it that the mapper itself does not know.
@@ -115,19 +116,24 @@ impl Checkpoints {
     /// If the messages end before, or are others than they were.
     pub(super) fn catch_up(
         &mut self,
-        gpu: &std::sync::Arc<Gpu>,
+        gpu: &Arc<Gpu>,
         config: &MappingConfig,
         (messages, tracker): (&Receiver<MapperMessage>, &Teller),
     ) -> Result<Option<Resumed>, PipelineError> {
         let Some(course) = self.from.take() else { return Ok(None) };
         let not_repeated = || PipelineError::NotRepeated { checkpoint: self.path.clone() };
-        let mut mapper = Mapper::restore(gpu.clone(), config, &course.mapper)?;
+        let explained = |error| match error {
+            MappingError::State => CheckpointError::Damaged { path: self.path.clone() }.into(),
+            MappingError::NotTheSame { .. } => not_repeated(),
+            error => error.into(),
+        };
+        let mut mapper = Mapper::restore(gpu.clone(), config, &course.mapper).map_err(explained)?;
         let mut told = course.told.iter();
         while self.heard.messages < course.heard.messages {
             let Ok(message) = messages.recv() else { return Err(PipelineError::NotCaughtUp { checkpoint: self.path.clone() }) };
             self.heard.hear(&message);
             if let MapperMessage::Keyframe(keyframe) = message {
-                mapper.insert_again(&keyframe, &course.mapper).map_err(|_| not_repeated())?;
+                mapper.insert_again(&keyframe, &course.mapper).map_err(explained)?;
                 tracker.tell(keyframe.id, told.next().ok_or_else(not_repeated)?);
             }
         }
