@@ -20,6 +20,9 @@ pub struct Config {
     pub adapter: Option<String>,
     /// Mapping resolution as a share of the recorded one.
     pub map_scale: f64,
+    /// Keyframes mapped, and rounds of the refinement, between two checkpoints; none are kept where absent.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub checkpoint_every: Option<usize>,
     pub replay: ReplayConfig,
     pub tracking: TrackingConfig,
     pub mapping: MappingConfig,
@@ -65,6 +68,7 @@ impl Default for Config {
             sequence: None,
             adapter: None,
             map_scale: 1.0,
+            checkpoint_every: None,
             replay: ReplayConfig::default(),
             tracking: TrackingConfig::default(),
             mapping: MappingConfig::default(),
@@ -178,6 +182,16 @@ impl Config {
         if self.replay.every == 0 {
             return value("replay.every must be at least 1".into());
         }
+        if self.checkpoint_every == Some(0) {
+            return value("checkpoint_every must be at least 1".into());
+        }
+        if self.checkpoint_every.is_some() && (self.replay.paced || self.mapping.yields_to_keyframes) {
+            return value(
+                "a run against the clock does not repeat and cannot be resumed: leave --checkpoint-every out, or --paced and \
+                 --budget realtime (replay.paced, mapping.yields_to_keyframes)"
+                    .into(),
+            );
+        }
         if self.replay.held_out_every == 1 {
             return value("replay.held_out_every = 1 would keep every frame from the mapper; use 0 to hold none out".into());
         }
@@ -190,9 +204,9 @@ impl Config {
         toml::to_string(self).expect("a configuration is plain data")
     }
 
-    /// The resolved configuration without the place of the recording: equal for runs that should give equal results.
+    /// The resolved configuration without the place of the recording and the checkpoints: equal for runs that should give equal results.
     pub fn identity(&self) -> String {
-        Self { sequence: None, ..self.clone() }.to_toml()
+        Self { sequence: None, checkpoint_every: None, ..self.clone() }.to_toml()
     }
 }
 

@@ -5,8 +5,8 @@ mod common;
 use std::path::{Path, PathBuf};
 
 use common::recording::{
-    FRAMES, HEIGHT, WIDTH, change_line, color_file, copy_of_recording, finish, keysplat, recording, run_command, scene, scratch,
-    skipped_without_adapter, stamps, truncate,
+    FRAMES, HEIGHT, WIDTH, change_line, color_file, copy_of_recording, finish, finish_child, keysplat, recording, run_command,
+    scene, scratch, skipped_without_adapter, stamps, truncate,
 };
 
 /// Spoils a copy of the recording, runs it, and checks that the error says `parts` and that no output was begun.
@@ -49,8 +49,12 @@ fn damaged_lists() {
     let empty = |folder: &Path| std::fs::write(folder.join("rgb.txt"), "# nothing\n").unwrap();
     refused("empty-list", empty, &[], &["empty-list/rgb.txt lists no frames", "copied whole"]);
 
-    let unsorted = |folder: &Path| change_line(&folder.join("rgb.txt"), 7, |line| line.replacen("0.1", "0.01", 1));
-    refused("unsorted", unsorted, &[], &[&at_line("unsorted", "rgb.txt", 7), "not after the one before it; sort the list"]);
+    for list in ["rgb", "depth", "groundtruth"] {
+        let (name, file) = (format!("unsorted-{list}"), format!("{list}.txt"));
+        let back = |line: &str| format!("0.05 {}", line.split_once(' ').unwrap().1);
+        let unsorted = |folder: &Path| change_line(&folder.join(&file), 7, back);
+        refused(&name, unsorted, &[], &[&at_line(&name, &file, 7), "not after the one before it; sort the"]);
+    }
 
     let nan = |folder: &Path| {
         change_line(&folder.join("groundtruth.txt"), 5, |line| {
@@ -292,4 +296,37 @@ fn a_full_disk() {
     let generated = finish(keysplat([Path::new("generate"), &scene, Path::new("--out"), &target]));
     generated.refused(&["cannot write", disk.0.path().to_str().unwrap(), "has space"]);
     assert_eq!(std::fs::read_dir(disk.0.path()).unwrap().count(), 1, "only the run's folder is left");
+}
+
+/// The disk fills up while the map grows: the run goes on and warns once, and goes on from the last checkpoint when there is space.
+#[cfg(target_os = "linux")]
+#[test]
+fn a_disk_that_fills_up_between_checkpoints() {
+    if skipped_without_adapter() {
+        return;
+    }
+    let Some(disk) = SmallDisk::mount("64m") else {
+        eprintln!("SKIPPED: mounting a small disk takes the rights of root");
+        return;
+    };
+    let more = ["--set", "tracking.keyframe_translation=0.02", "--set", "mapping.iterations_per_keyframe=10"];
+    let (whole, out) = (scratch().join("never-full"), disk.0.path().join("out"));
+    finish(run_command(recording(), &whole, &more)).succeeded();
+    let child = run_command(recording(), &out, &[&more[..], &["--checkpoint-every", "1"]].concat()).spawn().unwrap();
+    let (checkpoint, filler) = (out.join("checkpoint.bin"), disk.0.path().join("filler"));
+    // The first one has no map yet.
+    while std::fs::metadata(&checkpoint).map_or(0, |file| file.len()) < 100_000 {
+        std::thread::sleep(std::time::Duration::from_millis(1));
+    }
+    std::fs::write(&filler, vec![0; 64 << 20]).unwrap_err();
+    let said = finish_child(child, String::new());
+    said.refused(&["cannot write", "free some space or write to another disk"]);
+    let warnings = said.stderr.lines().filter(|line| line.contains("the run goes on"));
+    assert!(warnings.clone().count() == 1 && warnings.clone().all(|line| line.contains("checkpoint.bin")), "{}", said.stderr);
+    std::fs::remove_file(&filler).unwrap();
+    finish(keysplat([Path::new("resume"), &out])).succeeded();
+    for file in ["trajectory.txt", "map.ply"] {
+        assert!(std::fs::read(out.join(file)).unwrap() == std::fs::read(whole.join(file)).unwrap(), "{file} differs");
+    }
+    assert!(!checkpoint.exists());
 }

@@ -53,7 +53,7 @@ fn a_lost_device_ends_the_run_with_what_was_mapped() {
             }
             gpu.device.destroy();
         });
-        pipeline::run(&sequence, gpu, &config(), progress).unwrap()
+        pipeline::run(&sequence, gpu, &config(), progress, None).unwrap()
     });
     assert!(matches!(gpu_error(&outcome), GpuError::Failed(_)), "{:?}", outcome.error);
     assert_written("lost-device", &outcome);

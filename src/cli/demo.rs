@@ -35,7 +35,7 @@ pub fn demo(args: &DemoArgs, verbosity: Verbosity) -> miette::Result<()> {
     let config = Config { sequence, map_scale: MAP_SCALE, ..Config::default() };
     let stop = Arc::new(AtomicBool::new(false));
     progress::stop_on_ctrl_c(&stop)?;
-    run::replay(config, args.out.clone(), stop, verbosity)?;
+    run::replay(config, args.out.clone(), None, stop, verbosity)?;
     if !verbosity.shows_progress() {
         return Ok(());
     }

@@ -7,6 +7,7 @@ mod eval;
 mod generate;
 mod progress;
 mod report;
+mod resume;
 mod run;
 mod stress;
 
@@ -43,6 +44,8 @@ enum LogFormat {
 enum Command {
     /// Replay a recording into a trajectory and a map.
     Run(run::RunArgs),
+    /// Go on with a run that was interrupted and kept checkpoints.
+    Resume(resume::ResumeArgs),
     /// Render the demo's synthetic room and map it.
     Demo(demo::DemoArgs),
     /// Render a synthetic scene as a recording.
@@ -91,6 +94,7 @@ pub fn main() -> ExitCode {
 fn execute(command: Command, verbosity: Verbosity) -> miette::Result<()> {
     match command {
         Command::Run(args) => run::run(args, verbosity),
+        Command::Resume(args) => resume::resume(args, verbosity),
         Command::Demo(args) => demo::demo(&args, verbosity),
         Command::Generate(args) => generate::generate(&args, verbosity),
         Command::Eval(args) => eval::eval(&args, verbosity),

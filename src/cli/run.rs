@@ -9,7 +9,7 @@ use clap::{Args, ValueEnum};
 use indicatif::ProgressBar;
 use keysplat::config::{Config, SequenceConfig};
 use keysplat::gpu::Gpu;
-use keysplat::pipeline::{self, Budget, Outcome, PipelineError, Progress, outputs};
+use keysplat::pipeline::{self, Budget, Checkpoint, Checkpoints, Outcome, PipelineError, Progress, outputs};
 use keysplat::sequence::{Layout, Sensor, SensorKind, Sequence, is_camera_file};
 use miette::{IntoDiagnostic, miette};
 
@@ -62,6 +62,9 @@ pub struct RunArgs {
     /// Most GPU memory that the mapper may use, e.g. 500M or 2G.
     #[arg(long, value_parser = parse_bytes)]
     max_gpu_memory: Option<u64>,
+    /// Keep a checkpoint after every so many keyframes (and rounds of a refinement), for `keysplat resume`.
+    #[arg(long, value_name = "N")]
+    checkpoint_every: Option<usize>,
     /// Set any value of the configuration, e.g. --set mapping.iterations_per_keyframe=20 (may be given again).
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
@@ -146,6 +149,7 @@ impl RunArgs {
         config.replay.frames = self.frames.or(config.replay.frames);
         config.replay.paced |= self.paced;
         config.adapter = self.adapter.clone().or(config.adapter);
+        config.checkpoint_every = self.checkpoint_every.or(config.checkpoint_every);
         config.mapping.limits.max_gaussians = self.max_gaussians.or(config.mapping.limits.max_gaussians);
         config.mapping.limits.max_gpu_bytes = self.max_gpu_memory.or(config.mapping.limits.max_gpu_bytes);
         config.with_settings(&self.set).into_diagnostic()
@@ -161,7 +165,7 @@ pub fn run(args: RunArgs, verbosity: Verbosity) -> miette::Result<()> {
     }
     let stop = Arc::new(AtomicBool::new(false));
     progress::stop_on_ctrl_c(&stop)?;
-    replay(config, args.out, stop, verbosity)
+    replay(config, args.out, None, stop, verbosity)
 }
 
 /// Opens the recording that a configuration names, with its selection of frames. A range that goes on beyond the recording then
@@ -186,8 +190,14 @@ pub fn open(config: &mut Config) -> miette::Result<Sequence> {
     Ok(sequence)
 }
 
-/// Replays, writes everything, measures, prints. What was made is written before an error is reported.
-pub fn replay(mut config: Config, out: PathBuf, stop: Arc<AtomicBool>, verbosity: Verbosity) -> miette::Result<()> {
+/// Replays, writes everything, measures, prints. What was made is written before an error is reported. Goes on from a checkpoint, if given.
+pub fn replay(
+    mut config: Config,
+    out: PathBuf,
+    from: Option<Checkpoint>,
+    stop: Arc<AtomicBool>,
+    verbosity: Verbosity,
+) -> miette::Result<()> {
     let sequence = open(&mut config)?;
     let config = &config;
     if !config.replay.known_poses {
@@ -195,6 +205,7 @@ pub fn replay(mut config: Config, out: PathBuf, stop: Arc<AtomicBool>, verbosity
     }
     let gpu = Gpu::open(config.adapter.as_deref()).into_diagnostic()?;
     outputs::prepare_folder(&out).into_diagnostic()?;
+    let checkpoints = checkpoints(from, (&sequence, config), &gpu, &out)?;
     tracing::info!(
         sequence = sequence.name,
         sensor = %sequence.sensor.kind(),
@@ -209,7 +220,7 @@ pub fn replay(mut config: Config, out: PathBuf, stop: Arc<AtomicBool>, verbosity
         let (windows, done) = (&windows, &done);
         let bar = progress::bar(verbosity, sequence.entries.len() as u64, "{wide_bar} {pos}/{len} frames  {msg}");
         scope.spawn(move || show(windows, &bar, done));
-        let outcome = pipeline::run(&sequence, &gpu, config, windows);
+        let outcome = pipeline::run(&sequence, &gpu, config, windows, checkpoints);
         done.store(true, Ordering::Relaxed);
         outcome
     })
@@ -219,11 +230,30 @@ pub fn replay(mut config: Config, out: PathBuf, stop: Arc<AtomicBool>, verbosity
         return nothing_made(sequence.sensor, error, windows.stopped());
     }
     let finished = write_and_measure((&sequence, config), &gpu, &outcome, &out, verbosity);
+    if error.is_none() && finished.is_ok() && !windows.stopped() {
+        outputs::remove_checkpoint(&out).into_diagnostic()?;
+    } else if config.checkpoint_every.is_some() {
+        tracing::info!("keysplat resume {} goes on from the last checkpoint", out.display());
+    }
     match (error, finished) {
         (None, finished) => finished,
         (Some(error), Ok(())) => Err(miette!("{error}\nThe run ended early; what there was until then is in {}", out.display())),
         (Some(error), Err(then)) => Err(miette!("{error}\nThe run ended early, and then: {then}")),
     }
+}
+
+/// Those of the run, if it keeps any.
+fn checkpoints(
+    from: Option<Checkpoint>,
+    recording: (&Sequence, &Config),
+    gpu: &Gpu,
+    out: &Path,
+) -> miette::Result<Option<Checkpoints>> {
+    if let Some(checkpoint) = from {
+        return Checkpoints::resume(checkpoint, recording, gpu).map(Some).into_diagnostic();
+    }
+    let begin = |_| Checkpoints::begin(&out.join(outputs::CHECKPOINT), recording, gpu);
+    recording.1.checkpoint_every.map(begin).transpose().into_diagnostic()
 }
 
 fn write_and_measure(

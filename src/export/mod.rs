@@ -88,16 +88,41 @@ fn advice(kind: ErrorKind) -> &'static str {
 /// Writes a file so that it is never seen half-written: under another name in the same folder first, then renamed. Replaces what
 /// was there. Not flushed to the disk itself: a power cut may still lose it.
 pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), ExportError> {
+    write(path, bytes, |_| Ok(()))
+}
+
+/// The same, flushed to the disk itself: after a power cut either the new file or the old one is there.
+pub fn write_durably(path: &Path, bytes: &[u8]) -> Result<(), ExportError> {
+    write(path, bytes, std::fs::File::sync_all)?;
+    // The rename is the folder's to keep; not every system opens folders as files.
+    let folder = path.parent().and_then(|folder| std::fs::File::open(folder).ok());
+    let _ = folder.map(|folder| folder.sync_all());
+    Ok(())
+}
+
+/// Removes what writes that were killed left in a folder, as far as that is possible.
+pub fn remove_partials(folder: &Path) {
+    let is_partial = |name: &str| name.starts_with('.') && name.ends_with(PARTIAL);
+    let entries = std::fs::read_dir(folder).into_iter().flatten().filter_map(Result::ok);
+    for entry in entries.filter(|entry| entry.file_name().to_str().is_some_and(is_partial)) {
+        let _ = std::fs::remove_file(entry.path());
+    }
+}
+
+const PARTIAL: &str = ".partial";
+
+fn write(path: &Path, bytes: &[u8], flush: impl Fn(&std::fs::File) -> std::io::Result<()>) -> Result<(), ExportError> {
     let write_error = |source| ExportError::Write { path: path.into(), source };
     let Some(name) = path.file_name() else {
         return Err(write_error(ErrorKind::IsADirectory.into()));
     };
     let mut partial_name = std::ffi::OsString::from(".");
     partial_name.push(name);
-    partial_name.push(format!(".{}.partial", std::process::id()));
+    partial_name.push(format!(".{}{PARTIAL}", std::process::id()));
     let partial = path.with_file_name(partial_name);
-    let written =
-        std::fs::File::create(&partial).and_then(|mut file| file.write_all(bytes)).and_then(|()| std::fs::rename(&partial, path));
+    let written = std::fs::File::create(&partial)
+        .and_then(|mut file| file.write_all(bytes).and_then(|()| flush(&file)))
+        .and_then(|()| std::fs::rename(&partial, path));
     written.map_err(|source| {
         // Best effort: what failed is more worth telling than what is left over.
         let _ = std::fs::remove_file(&partial);
@@ -158,6 +183,10 @@ mod tests {
         write_atomically(&path, b"one").unwrap();
         write_atomically(&path, b"two").unwrap();
         assert_eq!(std::fs::read(&path).unwrap(), b"two");
+        write_durably(&path, b"three").unwrap();
+        assert_eq!(std::fs::read(&path).unwrap(), b"three");
+        std::fs::write(folder.path().join(".file.123.partial"), b"th").unwrap();
+        remove_partials(folder.path());
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
     }
 

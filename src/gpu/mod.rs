@@ -3,6 +3,7 @@
 mod buffer;
 mod device;
 mod kernel;
+pub mod plain;
 mod profile;
 
 pub use buffer::GpuBuffer;

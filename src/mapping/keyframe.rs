@@ -1,11 +1,14 @@
 //! A keyframe as the mapper receives and keeps it.
 
+use std::borrow::Cow;
+
 use image::{GrayImage, Rgb, RgbImage};
+use serde::{Deserialize, Serialize};
 
 use super::plane_sweep::{self, SourceView};
 use super::refine_poses::{RefinePosesConfig, Refinement, median_depth};
 use crate::geometry::{Pinhole, Se3};
-use crate::gpu::{Gpu, GpuError};
+use crate::gpu::{Gpu, GpuError, plain};
 use crate::optimise::{TargetImage, TrainingView};
 use crate::sequence::{DepthImage, RectifiedImage};
 use crate::splat::ViewCamera;
@@ -69,26 +72,123 @@ struct Images {
     half: Option<TargetImage>,
 }
 
-impl MappedKeyframe {
-    /// Uploads the images; `with_half` also at half the size, if that is still an image worth comparing.
-    pub fn new(gpu: &Gpu, keyframe: &Keyframe, with_half: bool) -> Result<Self, GpuError> {
+/// All of a keyframe but its image, which the recording has.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub(super) struct KeyframeState {
+    pub id: KeyframeId,
+    camera: ViewCamera,
+    tracked_from_world: Se3,
+    refinement: Refinement,
+    depth_metres: f64,
+    covisible: Vec<KeyframeId>,
+    loss: f32,
+    /// Nothing where the image was given back.
+    tile_losses: Option<TileLosses>,
+    /// Depth that was swept for, `[H, W]`: it depends on what the other poses were then. Nothing where the recording has it.
+    swept: Option<Swept>,
+}
+
+#[derive(Clone, Debug, Serialize, Deserialize)]
+struct Swept {
+    #[serde(with = "plain")]
+    metres: Vec<f32>,
+}
+
+/// `[tiles]` of the image and of the one at half the size, empty where there is none.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+struct TileLosses {
+    #[serde(with = "plain")]
+    whole: Vec<[f32; 4]>,
+    #[serde(with = "plain")]
+    half: Vec<[f32; 4]>,
+}
+
+impl Images {
+    /// Uploads an image; `with_half` also at half the size, if that is still an image worth comparing.
+    fn new(gpu: &Gpu, image: &RectifiedImage, with_half: bool) -> Result<Self, GpuError> {
         let target = |image: &RectifiedImage| {
             let depth = image.depth.as_ref().map(|d| d.metres.as_slice());
             TargetImage::new(gpu, &image.color, depth)
         };
-        let (image, tracked_from_world) = (&keyframe.image, keyframe.world_from_camera.inverse());
         let worth = with_half && image.pinhole.width.min(image.pinhole.height) >= MIN_HALVED;
+        Ok(Self { whole: target(image)?, half: worth.then(|| target(&halved(image))).transpose()? })
+    }
+
+    fn tile_losses(&self, gpu: &Gpu) -> Result<TileLosses, GpuError> {
+        let half = self.half.as_ref().map_or(Ok(Vec::new()), |half| half.tile_losses(gpu));
+        Ok(TileLosses { whole: self.whole.tile_losses(gpu)?, half: half? })
+    }
+
+    /// Says whether they are of images of these sizes.
+    fn set_tile_losses(&self, gpu: &Gpu, losses: &TileLosses) -> bool {
+        let half = self.half.as_ref().map_or(losses.half.is_empty(), |half| half.set_tile_losses(gpu, &losses.half));
+        self.whole.set_tile_losses(gpu, &losses.whole) && half
+    }
+}
+
+impl MappedKeyframe {
+    /// Uploads the images, see [`Images::new`].
+    pub fn new(gpu: &Gpu, keyframe: &Keyframe, with_half: bool) -> Result<Self, GpuError> {
+        let (image, tracked_from_world) = (&keyframe.image, keyframe.world_from_camera.inverse());
         Ok(Self {
             id: keyframe.id,
             camera: ViewCamera { pinhole: image.pinhole, camera_from_world: tracked_from_world },
             tracked_from_world,
             refinement: Refinement::default(),
             depth_metres: median_depth(image),
-            image: Some(Images { whole: target(image)?, half: worth.then(|| target(&halved(image))).transpose()? }),
+            image: Some(Images::new(gpu, image, with_half)?),
             gray: matches!(keyframe.depth_source, DepthSource::Landmarks { .. }).then(|| plane_sweep::gray(&image.color)),
             covisible: keyframe.covisible.clone(),
             loss: 1.0,
         })
+    }
+
+    pub fn state(&self, gpu: &Gpu) -> Result<KeyframeState, GpuError> {
+        Ok(KeyframeState {
+            id: self.id,
+            camera: self.camera,
+            tracked_from_world: self.tracked_from_world,
+            refinement: self.refinement,
+            depth_metres: self.depth_metres,
+            covisible: self.covisible.clone(),
+            loss: self.loss,
+            tile_losses: self.image.as_ref().map(|image| image.tile_losses(gpu)).transpose()?,
+            swept: self
+                .image
+                .as_ref()
+                .filter(|_| self.gray.is_some())
+                .map(|image| image.whole.depth_metres(gpu))
+                .transpose()?
+                .map(|metres| Swept { metres }),
+        })
+    }
+
+    /// The keyframe of a state, with the image that it had; `None` if the state is of an image of another size.
+    pub fn restore(gpu: &Gpu, state: &KeyframeState, keyframe: &Keyframe, with_half: bool) -> Result<Option<Self>, GpuError> {
+        let mut image = Cow::Borrowed(&keyframe.image);
+        if let Some(Swept { metres }) = &state.swept {
+            let Pinhole { width, height, .. } = image.pinhole;
+            if metres.len() as u64 != u64::from(width) * u64::from(height) {
+                return Ok(None);
+            }
+            image.to_mut().depth = Some(DepthImage { width, height, metres: metres.clone() });
+        }
+        let image = &*image;
+        let images = state.tile_losses.as_ref().map(|_| Images::new(gpu, image, with_half)).transpose()?;
+        if !images.iter().zip(&state.tile_losses).all(|(images, losses)| images.set_tile_losses(gpu, losses)) {
+            return Ok(None);
+        }
+        Ok(Some(Self {
+            id: state.id,
+            camera: state.camera,
+            tracked_from_world: state.tracked_from_world,
+            refinement: state.refinement,
+            depth_metres: state.depth_metres,
+            gray: state.swept.as_ref().map(|_| plane_sweep::gray(&image.color)),
+            image: images,
+            covisible: state.covisible.clone(),
+            loss: state.loss,
+        }))
     }
 
     /// The tracker moved it; its refinement goes along.

@@ -4,6 +4,8 @@
 use std::collections::BTreeMap;
 use std::ops::Range;
 
+use serde::{Deserialize, Serialize};
+
 use super::KeyframeId;
 use crate::geometry::Se3;
 use crate::optimise::GaussianScore;
@@ -13,7 +15,7 @@ const MIN_SHIFT_METRES: f64 = 0.01;
 const MIN_TURN_RAD: f64 = 0.5 * std::f64::consts::PI / 180.0;
 
 /// Of one Gaussian.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub(super) struct Entry {
     /// It moves with this keyframe.
     pub anchor: KeyframeId,
@@ -28,7 +30,7 @@ pub(super) struct Entry {
 }
 
 /// The entries, `[N]` in map order. Seeds are appended and pruning keeps the order, so most of a keyframe's Gaussians lie side by side.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub(super) struct Ledger {
     entries: Vec<Entry>,
 }

@@ -1,6 +1,7 @@
 //! The mapper: owns the Gaussians, their moments and the keyframe window.
 
 mod refine;
+mod state;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -11,6 +12,7 @@ use glam::{Quat, Vec3};
 use serde::{Deserialize, Serialize};
 
 pub use refine::{RefineReport, Refinement};
+pub use state::MapperState;
 
 use super::density::{self, Candidate};
 use super::keyframe::{DepthSource, MappedKeyframe};
@@ -39,6 +41,10 @@ pub enum MappingError {
     NoDepth { id: KeyframeId },
     #[error("the loss of keyframe {id} is not finite; please report this with the recording's name and the configuration")]
     NotFinite { id: KeyframeId },
+    #[error("keyframe {id} comes in another place or another size than before")]
+    NotTheSame { id: KeyframeId },
+    #[error("the mapper's state contradicts itself")]
+    State,
 }
 
 /// What happened to a keyframe.

@@ -18,6 +18,6 @@ pub use config::{MappingConfig, PointsConfig, RefineConfig, SeedingConfig, SkipC
 pub use density::{ClassicConfig, DensityConfig, DensityStrategy, VcdConfig};
 pub use keyframe::{DepthSource, Keyframe, KeyframeId, RightImage};
 pub use limits::LimitsConfig;
-pub use mapper::{KeyframeReport, Mapper, MappingError, RefineReport, Refinement};
+pub use mapper::{KeyframeReport, Mapper, MapperState, MappingError, RefineReport, Refinement};
 pub use plane_sweep::PlaneSweepConfig;
 pub use refine_poses::{RefinePosesConfig, RefinedPair};

@@ -82,7 +82,7 @@ impl RefinePosesConfig {
 }
 
 /// How one keyframe's pose differs from the tracker's, and Adam's moments.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 pub(super) struct Refinement {
     /// camera_from_world = refined_from_tracked · tracked_from_world
     pub refined_from_tracked: Se3,
@@ -128,7 +128,7 @@ impl Refinement {
 }
 
 /// What the images say of two keyframes, in the terms of the tracker.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RefinedPair {
     pub keyframe: KeyframeId,
     pub relative_to: KeyframeId,

@@ -24,7 +24,7 @@ const SIZES_KEPT: usize = 2;
 /// What the loss needs of a view's size. The partials' borders stay zero, so another size cannot share them.
 #[derive(Debug)]
 pub(super) struct ImageBuffers {
-    size: (u32, u32),
+    pub size: (u32, u32),
     /// The step's target, copied to one place: bind groups over each view's own buffers would be made anew all the time.
     pub target: TargetImage,
     pub partials: GpuBuffer,

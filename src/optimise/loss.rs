@@ -104,6 +104,25 @@ impl TargetImage {
         Ok(Self { width, height, color: plane("target colour")?, depth: plane("target depth")?, tile_losses })
     }
 
+    /// Its depth, `[H, W]`, read back.
+    pub fn depth_metres(&self, gpu: &Gpu) -> Result<Vec<f32>, GpuError> {
+        self.depth.read(gpu, 0, (self.width * self.height) as usize)
+    }
+
+    /// The losses of its tiles when each was last worked on, read back.
+    pub fn tile_losses(&self, gpu: &Gpu) -> Result<Vec<[f32; 4]>, GpuError> {
+        self.tile_losses.read(gpu, 0, image_buffers::tiles((self.width, self.height)))
+    }
+
+    /// Puts these in their place; says whether there are as many as tiles.
+    pub fn set_tile_losses(&self, gpu: &Gpu, losses: &[[f32; 4]]) -> bool {
+        let fits = losses.len() == image_buffers::tiles((self.width, self.height));
+        if fits {
+            self.tile_losses.write(gpu, 0, losses);
+        }
+        fits
+    }
+
     /// Becomes a copy of an image of the same size.
     pub(super) fn encode_copy(&self, encoder: &mut wgpu::CommandEncoder, of: &Self) {
         for (from, to) in [(&of.color, &self.color), (&of.depth, &self.depth)] {

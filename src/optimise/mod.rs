@@ -10,6 +10,6 @@ mod skip;
 
 pub use adam::AdamConfig;
 pub use loss::{LossConfig, LossTerms, TargetImage};
-pub use optimiser::{Gradients, Optimiser, StepReport, TrainingView};
+pub use optimiser::{Gradients, Optimiser, OptimiserState, StepReport, TrainingView};
 pub use scores::{GaussianScore, WrongPixels};
 pub use skip::TileSkip;

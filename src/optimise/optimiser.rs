@@ -1,6 +1,10 @@
 //! One training step on the GPU: forward, loss, backward, Adam; and the same without stepping, for whoever wants the gradients.
 
+mod state;
+
 use std::time::{Duration, Instant};
+
+pub use state::OptimiserState;
 
 use bytemuck::{Pod, Zeroable};
 
@@ -380,11 +384,7 @@ impl Optimiser {
 
     fn reserve(&mut self, gpu: &Gpu, view: &View, cloud: &GpuCloud) -> Result<(), GpuError> {
         image_buffers::choose(&mut self.images, gpu, (view.width, view.height))?;
-        if cloud.capacity() > self.gaussians {
-            self.pose_sums = GpuBuffer::storage(gpu, "pose sums", (cloud.capacity() as u64).div_ceil(256) * 32)?;
-            self.gaussians = cloud.capacity();
-        }
-        Ok(())
+        self.reserve_gaussians(gpu, cloud.capacity())
     }
 }
 

@@ -62,9 +62,18 @@ impl Scores {
 
     /// Forgets all views; the cloud must not change until the scores are read.
     pub fn clear(&mut self, gpu: &Gpu, cloud: &GpuCloud) -> Result<(), GpuError> {
-        self.capacity = cloud.capacity();
-        self.scores = GpuBuffer::storage(gpu, "scores", cloud.capacity() as u64 * 32)?;
+        self.reserve(gpu, cloud.capacity())
+    }
+
+    /// Room for so many Gaussians, zeroed.
+    pub fn reserve(&mut self, gpu: &Gpu, capacity: usize) -> Result<(), GpuError> {
+        self.capacity = capacity;
+        self.scores = GpuBuffer::storage(gpu, "scores", capacity as u64 * 32)?;
         Ok(())
+    }
+
+    pub fn capacity(&self) -> usize {
+        self.capacity
     }
 
     /// Adds the scores of a view whose loss and its gradient are there, before the backward pass.

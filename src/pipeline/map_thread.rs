@@ -5,12 +5,13 @@ use std::time::Instant;
 
 use crossbeam::channel::Receiver;
 
+use super::keeper::{Checkpoints, Resumed};
 use super::measurements::Teller;
 use super::messages::guarded;
 use super::{KeyframeRecord, MapperMessage, PipelineError, Progress};
 use crate::evaluation::machine;
 use crate::gpu::Gpu;
-use crate::mapping::{KeyframeReport, Mapper, MappingConfig};
+use crate::mapping::{KeyframeReport, Mapper, MappingConfig, RefinedPair, Refinement};
 use crate::splat::{GaussianCloud, MapSnapshot};
 
 /// What mapping came to, also when it ended early.
@@ -21,6 +22,8 @@ pub(super) struct MapSummary {
     pub keyframes: Vec<KeyframeRecord>,
     /// Duration of each optimisation step, milliseconds.
     pub step_ms: Vec<f64>,
+    /// It did not come as far as the checkpoint that it was to go on from, and there is nothing to write.
+    pub behind: bool,
     pub error: Option<PipelineError>,
 }
 
@@ -31,30 +34,35 @@ pub(super) struct Round<'a> {
     pub steps: usize,
 }
 
-/// Maps until the tracker hangs up, then refines; or until an error. `on_round` hears of each round of the refinement.
+/// Maps until the tracker hangs up, then refines; or until an error. `on_round` hears of each round of the refinement. With checkpoints, it
+/// goes on from the one that there is, and keeps more.
 pub(super) fn map(
     gpu: &Arc<Gpu>,
     config: &MappingConfig,
     messages: &Receiver<MapperMessage>,
     tracker: &Teller,
     (progress, on_round): (&Progress, &mut dyn FnMut(Round<'_>)),
+    mut checkpoints: Option<Checkpoints>,
 ) -> MapSummary {
-    let mut summary = MapSummary::default();
-    let mut mapper = match Mapper::new(gpu.clone(), config) {
-        Ok(mapper) => mapper,
-        Err(error) => return MapSummary { error: Some(error.into()), ..summary },
+    let begun = guarded("mapping", || begin(gpu, config, (messages, tracker), checkpoints.as_mut()));
+    let (Resumed { mut mapper, refinement, records }, cloud) = match begun {
+        Ok(begun) => begun,
+        Err(error) => return MapSummary { behind: checkpoints.is_some(), error: Some(error), ..MapSummary::default() },
     };
+    let earlier_s = records.last().map_or(0.0, |record| record.done_s);
+    let mut summary = MapSummary { cloud, keyframes: records, ..MapSummary::default() };
     let started = Instant::now();
     for message in messages.iter() {
         let (waiting, began) = (messages.len(), Instant::now());
         let stop = || progress.stopped() || (config.yields_to_keyframes && !messages.is_empty());
+        checkpoints.iter_mut().for_each(|c| c.hear(&message));
         let done = guarded("mapping", || take(&mut mapper, message, tracker, &stop));
         match done {
-            Ok(Taken { report, cloud }) => {
+            Ok(Taken { report, refined, cloud }) => {
                 tracing::debug!(?report, "message taken");
                 let record = |report| KeyframeRecord {
                     report,
-                    done_s: started.elapsed().as_secs_f64(),
+                    done_s: earlier_s + started.elapsed().as_secs_f64(),
                     busy_s: began.elapsed().as_secs_f64(),
                     waiting,
                     host_bytes: machine::host_bytes(),
@@ -62,6 +70,11 @@ pub(super) fn map(
                 summary.keyframes.extend(report.map(record));
                 let psnr_db = summary.keyframes.last().map_or(0.0, |k| k.report.psnr_db);
                 summary.publish(cloud, psnr_db, progress);
+                // A keyframe that was cut short is not as it would have been.
+                if let Some(checkpoints) = checkpoints.as_mut().filter(|_| report.is_some() && !progress.stopped()) {
+                    checkpoints.tell(refined);
+                    checkpoints.done(&mapper, None, &summary.keyframes);
+                }
             }
             Err(error) => {
                 summary.error = Some(error);
@@ -70,49 +83,76 @@ pub(super) fn map(
         }
     }
     if summary.error.is_none() {
-        let refined = guarded("mapping", || refine(&mut mapper, &mut summary, (progress, on_round)));
+        let begun = (refinement, checkpoints.as_mut());
+        let refined = guarded("mapping", || refine(&mut mapper, &mut summary, begun, (progress, on_round)));
         summary.error = refined.err();
     }
     summary.step_ms = mapper.step_times().iter().map(|t| t.as_secs_f64() * 1e3).collect();
     summary
 }
 
+/// The mapper to begin with, and its map: a new one, or that of a checkpoint.
+fn begin(
+    gpu: &Arc<Gpu>,
+    config: &MappingConfig,
+    channels: (&Receiver<MapperMessage>, &Teller),
+    checkpoints: Option<&mut Checkpoints>,
+) -> Result<(Resumed, Arc<GaussianCloud>), PipelineError> {
+    match checkpoints.map(|c| c.catch_up(gpu, config, channels)).transpose()?.flatten() {
+        Some(resumed) => {
+            let cloud = Arc::new(resumed.mapper.download()?);
+            Ok((resumed, cloud))
+        }
+        None => {
+            let mapper = Mapper::new(gpu.clone(), config)?;
+            Ok((Resumed { mapper, refinement: None, records: Vec::new() }, Arc::default()))
+        }
+    }
+}
+
 /// What a message did; the map, if it changed.
 struct Taken {
     report: Option<KeyframeReport>,
+    /// What the tracker was told of the keyframe.
+    refined: Vec<RefinedPair>,
     cloud: Option<Arc<GaussianCloud>>,
 }
 
 fn take(mapper: &mut Mapper, message: MapperMessage, tracker: &Teller, stop: &dyn Fn() -> bool) -> Result<Taken, PipelineError> {
-    let (report, changed) = match message {
+    let (report, refined, changed) = match message {
         MapperMessage::Points(points) => {
             mapper.add_points(&points, 0)?;
-            (None, true)
+            (None, Vec::new(), true)
         }
-        MapperMessage::PoseUpdate(updates) => (None, mapper.update_poses(&updates)? > 0),
+        MapperMessage::PoseUpdate(updates) => (None, Vec::new(), mapper.update_poses(&updates)? > 0),
         MapperMessage::Keyframe(keyframe) => {
             let report = mapper.insert(&keyframe, stop)?;
             let refined = mapper.refined();
             tracing::trace!(keyframe = keyframe.id, ?refined, "poses refined");
             tracker.tell(keyframe.id, &refined);
-            (Some(report), report.seeded + report.iterations > 0)
+            (Some(report), refined, report.seeded + report.iterations > 0)
         }
     };
     let cloud = if changed { Some(Arc::new(mapper.download()?)) } else { None };
-    Ok(Taken { report, cloud })
+    Ok(Taken { report, refined, cloud })
 }
 
-/// The refinement, a round at a time, each published.
+/// The refinement, a round at a time, each published; it goes on where it stood, if it had begun.
 fn refine(
     mapper: &mut Mapper,
     summary: &mut MapSummary,
+    (begun, mut checkpoints): (Option<Refinement>, Option<&mut Checkpoints>),
     (progress, on_round): (&Progress, &mut dyn FnMut(Round<'_>)),
 ) -> Result<(), PipelineError> {
-    let mut refinement = mapper.begin_refinement()?;
+    let first = mapper.begin_refinement()?;
+    let mut refinement = begun.unwrap_or(first);
     while let Some(report) = mapper.refine(&mut refinement, &|| progress.stopped())? {
         tracing::debug!(?report, "refined");
         summary.publish(Some(Arc::new(mapper.download()?)), report.psnr_db, progress);
         on_round(Round { cloud: &summary.cloud, steps: mapper.step_times().len() });
+        if let Some(checkpoints) = checkpoints.as_mut().filter(|_| !progress.stopped()) {
+            checkpoints.done(mapper, Some(&refinement), &summary.keyframes);
+        }
     }
     Ok(())
 }

@@ -7,6 +7,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use crossbeam::queue::ArrayQueue;
 
+use super::CheckpointError;
+use crate::export::ExportError;
 use crate::geometry::Se3;
 use crate::mapping::{Keyframe, KeyframeId, MappingError};
 use crate::sequence::KnownPoint;
@@ -43,6 +45,16 @@ pub enum PipelineError {
         "not one of the {frames} frames could be read; the first one failed so: {first}; check that the recording was copied whole"
     )]
     NothingRead { frames: usize, first: String },
+    #[error("the run ended before it had caught up with {checkpoint}, which is kept; resume it again")]
+    NotCaughtUp { checkpoint: PathBuf },
+    #[error(
+        "{checkpoint} cannot be resumed: this recording and its tracking are not what they were then; put the recording back as it was, or make the run anew"
+    )]
+    NotRepeated { checkpoint: PathBuf },
+    #[error(transparent)]
+    Checkpoint(#[from] CheckpointError),
+    #[error(transparent)]
+    Export(#[from] ExportError),
 }
 
 /// Tracker → mapper. The end of the sequence is the channel's end.

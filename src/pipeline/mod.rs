@@ -10,7 +10,10 @@
 //! No lock is taken on the per-frame path. A thread that panics ends its own work; what it had is still returned.
 
 mod budget;
+mod checkpoint;
+mod heard;
 mod history;
+mod keeper;
 mod known_poses;
 mod map_thread;
 mod measurements;
@@ -22,7 +25,9 @@ mod run;
 mod track_thread;
 
 pub use budget::{Budget, realtime_scale};
+pub use checkpoint::{Checkpoint, CheckpointError};
 pub use history::{FrameRecord, History, KeyframeRecord};
+pub use keeper::Checkpoints;
 pub use known_poses::check_known_poses;
 pub use messages::{MapperMessage, PipelineError, Progress};
 pub use recording::{Mapped, Recording, record};

@@ -12,7 +12,7 @@ use crate::config::Config;
 use crate::evaluation::metrics::{Adapter, AteFigures, MappingFigures, Metrics, RpeFigures, Times, UsualTimes};
 use crate::evaluation::views::{ComparedView, ViewSelection, evaluate_views};
 use crate::evaluation::{Alignment, Comparison, draw_trajectory, evaluate_trajectory, machine, sha256_hex, write_json};
-use crate::export::{ExportError, MapFormat, write_atomically};
+use crate::export::{ExportError, MapFormat, remove_partials, write_atomically};
 use crate::geometry::{Se3, Trajectory};
 use crate::gpu::{Gpu, GpuError};
 use crate::sequence::{SensorKind, Sequence};
@@ -28,6 +28,8 @@ pub const VIEWS: &str = "views";
 pub const DRAWING: &str = "trajectory.svg";
 pub const HISTORY: &str = "history.json";
 pub const COMPARISON: &str = "comparison.json";
+/// Until the run is finished, and if it keeps any.
+pub const CHECKPOINT: &str = "checkpoint.bin";
 
 /// At most this many held-out views are kept as pictures, spread evenly.
 const MAX_PICTURES: usize = 100;
@@ -51,10 +53,16 @@ pub enum OutputError {
 /// Creates the folder and checks that it can be written to, before any work starts.
 pub fn prepare_folder(out: &Path) -> Result<(), OutputError> {
     let probe = out.join(".writable");
+    remove_partials(out);
     std::fs::create_dir_all(out.join(VIEWS))
         .and_then(|()| std::fs::write(&probe, b""))
         .and_then(|()| std::fs::remove_file(&probe))
         .map_err(|source| OutputError::Folder { path: out.into(), source })
+}
+
+/// Removes the checkpoint of a run that is finished.
+pub fn remove_checkpoint(out: &Path) -> Result<(), OutputError> {
+    remove_file(&out.join(CHECKPOINT))
 }
 
 fn remove_file(path: &Path) -> Result<(), OutputError> {

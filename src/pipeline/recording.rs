@@ -92,7 +92,7 @@ impl Recording {
             paused += reached.elapsed();
         };
         let config = config.in_units(self.units_per_metre as f32);
-        let summary = map_thread::map(gpu, &config, &messages, &Teller::default(), (progress, &mut on_round));
+        let summary = map_thread::map(gpu, &config, &messages, &Teller::default(), (progress, &mut on_round), None);
         let MapSummary { cloud, step_ms, error, .. } = summary;
         let mapped = Mapped { cloud, wall_s: (started.elapsed() - paused).as_secs_f64(), steps: step_ms.len() };
         error.map_or(Ok(mapped), Err)

@@ -12,7 +12,7 @@ use super::measurements;
 use super::messages::guarded;
 use super::read_thread::{self, ReadSummary};
 use super::track_thread::{self, TrackSummary};
-use super::{History, PipelineError, Progress};
+use super::{Checkpoints, History, PipelineError, Progress};
 use crate::config::Config;
 use crate::evaluation::image::WINDOW as SSIM_WINDOW;
 use crate::geometry::{StampedPose, Trajectory};
@@ -68,9 +68,19 @@ pub fn check_size(sequence: &Sequence, map_scale: f64) -> Result<(), PipelineErr
     if width.min(height) < least { Err(PipelineError::TooSmall { width, height, least }) } else { Ok(()) }
 }
 
-/// Replays a sequence. Errors that end it early are in the outcome, beside what was made until then.
-pub fn run(sequence: &Sequence, gpu: &Arc<Gpu>, config: &Config, progress: &Progress) -> Result<Outcome, PipelineError> {
+/// Replays a sequence, from a checkpoint on if there is one. Errors that end it early are in the outcome, beside what was made until then.
+///
+/// # Errors
+/// If there is nothing for an outcome: threads that cannot be started, a checkpoint that the run does not come up to.
+pub fn run(
+    sequence: &Sequence,
+    gpu: &Arc<Gpu>,
+    config: &Config,
+    progress: &Progress,
+    checkpoints: Option<Checkpoints>,
+) -> Result<Outcome, PipelineError> {
     let started = Instant::now();
+    let earlier_s = checkpoints.as_ref().map_or(0.0, Checkpoints::earlier_s);
     let paced = config.replay.paced;
     let (frame_sender, frames) = bounded(if paced { 1 } else { FRAMES_AHEAD });
     let (message_sender, messages) = bounded(MESSAGES_AHEAD);
@@ -81,7 +91,7 @@ pub fn run(sequence: &Sequence, gpu: &Arc<Gpu>, config: &Config, progress: &Prog
         // A thread that cannot start drops its end of the channels, and the others end with it.
         let map = Builder::new()
             .name("mapping".into())
-            .spawn_scoped(scope, move || map_thread::map(gpu, mapping, &messages, &teller, (progress, &mut |_| ())))
+            .spawn_scoped(scope, move || map_thread::map(gpu, mapping, &messages, &teller, (progress, &mut |_| ()), checkpoints))
             .map_err(spawn_error("mapping"))?;
         let track = Builder::new()
             .name("tracking".into())
@@ -99,7 +109,12 @@ pub fn run(sequence: &Sequence, gpu: &Arc<Gpu>, config: &Config, progress: &Prog
             .map_err(spawn_error("reading"))?;
         Ok::<_, PipelineError>((join("reading", read), join("tracking", track), join("mapping", map)))
     })?;
-    Ok(outcome(sequence, started, read, track, map))
+    if let Ok(MapSummary { behind: true, error, .. }) = map {
+        let cause = track.map_or_else(Some, |track| track.error);
+        return Err(cause.or(error).expect("who falls behind says why"));
+    }
+    let wall_s = earlier_s + started.elapsed().as_secs_f64();
+    Ok(outcome(sequence, wall_s, read, track, map))
 }
 
 fn join<T>(thread: &'static str, handle: ScopedJoinHandle<'_, T>) -> Result<T, PipelineError> {
@@ -108,7 +123,7 @@ fn join<T>(thread: &'static str, handle: ScopedJoinHandle<'_, T>) -> Result<T, P
 
 fn outcome(
     sequence: &Sequence,
-    started: Instant,
+    wall_s: f64,
     read: Result<ReadSummary, PipelineError>,
     track: Result<TrackSummary, PipelineError>,
     map: Result<MapSummary, PipelineError>,
@@ -138,7 +153,7 @@ fn outcome(
         frames_late: read.late,
         keyframes_deferred: track.deferred,
         step_ms: map.step_ms,
-        wall_s: started.elapsed().as_secs_f64(),
+        wall_s,
         error: errors.into_iter().next(),
     }
 }

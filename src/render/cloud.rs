@@ -4,11 +4,12 @@ use std::ops::Range;
 
 use glam::{Quat, Vec3};
 use nalgebra::Point3;
+use serde::{Deserialize, Serialize};
 
 use super::layout::{BlendForm, GEOMETRY_PLANES, GatherSetup};
 use super::shaders;
 use crate::geometry::Se3;
-use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, workgroups};
+use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, plain, workgroups};
 use crate::splat::{GaussianCloud, ShDegree};
 
 /// Gaussians on the GPU, `[planes, capacity]` vec4 in each buffer. Plane 0 holds position and raw opacity, 1 the log scale,
@@ -24,6 +25,16 @@ pub struct GpuCloud {
     moments_1: GpuBuffer,
     moments_2: GpuBuffer,
     gather: Kernel,
+}
+
+/// A map with its moments, read back.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct CloudState {
+    capacity: usize,
+    limit: Option<usize>,
+    /// `[3, planes, N]`: parameters, first and second moments.
+    #[serde(with = "plain")]
+    values: Vec<[f32; 4]>,
 }
 
 impl GpuCloud {
@@ -187,6 +198,33 @@ impl GpuCloud {
     pub fn download(&self, gpu: &Gpu) -> Result<GaussianCloud, GpuError> {
         let read = (0..self.planes()).map(|plane| self.read_plane(gpu, plane)).collect::<Result<Vec<_>, _>>()?;
         Ok(cloud_from_planes(self.sh_degree, &read))
+    }
+
+    /// All that training needs to go on as if it had never stopped.
+    pub fn state(&self, gpu: &Gpu) -> Result<CloudState, GpuError> {
+        let mut values = Vec::with_capacity(3 * self.planes() * self.count);
+        for buffer in [&self.parameters, &self.moments_1, &self.moments_2] {
+            for plane in 0..self.planes() {
+                values.extend(buffer.read::<[f32; 4]>(gpu, plane * self.capacity, self.count)?);
+            }
+        }
+        Ok(CloudState { capacity: self.capacity, limit: self.limit, values })
+    }
+
+    /// The map of a state, to the bit; `None` if that is no map of this degree.
+    pub fn restore(gpu: &Gpu, sh_degree: ShDegree, state: &CloudState) -> Result<Option<Self>, GpuError> {
+        let planes = planes(sh_degree);
+        let count = state.values.len() / (3 * planes);
+        if state.values.len() != 3 * planes * count || state.capacity < count {
+            return Ok(None);
+        }
+        let mut cloud = Self::new(gpu, sh_degree, state.capacity)?;
+        (cloud.count, cloud.limit) = (count, state.limit);
+        let buffers = [&cloud.parameters, &cloud.moments_1, &cloud.moments_2];
+        for (i, plane) in state.values.chunks_exact(count.max(1)).enumerate() {
+            buffers[i / planes].write(gpu, (i % planes) * cloud.capacity, plane);
+        }
+        Ok(Some(cloud))
     }
 }
 

@@ -7,8 +7,8 @@ pub(crate) mod shaders;
 mod sort;
 mod workspace;
 
-pub use cloud::{GpuCloud, cloud_from_planes};
+pub use cloud::{CloudState, GpuCloud, cloud_from_planes};
 pub use layout::BlendForm;
 pub use rasterizer::{PreparedView, Rasterizer, Rendered, ViewCounts};
 pub use shaders::{SHADERS, ShaderSource};
-pub use workspace::Workspace;
+pub use workspace::{Room, Workspace};

@@ -11,7 +11,7 @@ use super::cloud::GpuCloud;
 use super::layout::{BlendForm, COUNTERS, Counter, PAIR_COUNTER, ScanSetup, TileListsSetup, VISIBLE_COUNTER, View};
 use super::shaders;
 use super::sort::{Scan, ScanJob, Sort};
-use super::workspace::Workspace;
+use super::workspace::{Room, Workspace};
 use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, workgroups};
 use crate::splat::ViewCamera;
 
@@ -128,11 +128,21 @@ impl Rasterizer {
         self.form
     }
 
+    /// What the scratch buffers have room for.
+    pub fn room(&self) -> Room {
+        self.workspace.room()
+    }
+
+    /// Makes as much room as another rasterizer had.
+    pub fn make(&mut self, room: Room) -> Result<(), GpuError> {
+        self.workspace.make(&self.gpu, room)
+    }
+
     /// Makes room for the view and tells the GPU of it; it must be submitted before another is prepared.
     pub fn prepare(&mut self, cloud: &GpuCloud, camera: &ViewCamera, background: [f32; 3]) -> Result<PreparedView, GpuError> {
         let mut view = View::new(camera, background);
         self.workspace.reserve_gaussians(&self.gpu, cloud.capacity())?;
-        self.workspace.reserve_image(&self.gpu, &view)?;
+        self.workspace.reserve_image(&self.gpu, (view.pixels(), view.tiles()))?;
         view.gaussian_count = cloud.len() as u32;
         // All per-Gaussian buffers of the workspace are at least as long as the map's planes, whose stride both share.
         view.capacity = cloud.capacity() as u32;

@@ -1,6 +1,8 @@
 //! The rasterizer's scratch buffers, grown when a view needs more.
 
-use super::layout::{COUNTERS, Counter, SCAN_BLOCK, SORT_BLOCK, SORT_CHUNK, View};
+use serde::{Deserialize, Serialize};
+
+use super::layout::{COUNTERS, Counter, SCAN_BLOCK, SORT_BLOCK, SORT_CHUNK};
 use crate::gpu::{Gpu, GpuBuffer, GpuError};
 
 /// Bytes of one pair's gradient: three vec4.
@@ -40,6 +42,15 @@ pub struct Workspace {
     pub state: GpuBuffer,
 }
 
+/// What a workspace has room for.
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
+pub struct Room {
+    gaussians: usize,
+    pairs: usize,
+    pixels: u32,
+    tiles: u32,
+}
+
 impl Workspace {
     pub(super) fn new(gpu: &Gpu) -> Result<Self, GpuError> {
         let (capacity, pair_capacity) = (16_384, 131_072);
@@ -73,6 +84,17 @@ impl Workspace {
         Ok(workspace)
     }
 
+    pub(super) fn room(&self) -> Room {
+        Room { gaussians: self.capacity, pairs: self.pair_capacity, pixels: self.pixels, tiles: self.tiles }
+    }
+
+    /// As much room as another workspace had, exactly: by the room for pairs it depends which steps are repeated.
+    pub(super) fn make(&mut self, gpu: &Gpu, room: Room) -> Result<(), GpuError> {
+        self.reserve_gaussians(gpu, room.gaussians)?;
+        self.grow_pairs(gpu, room.pairs)?;
+        self.reserve_image(gpu, (room.pixels, room.tiles))
+    }
+
     pub(super) fn reserve_gaussians(&mut self, gpu: &Gpu, capacity: usize) -> Result<(), GpuError> {
         if capacity <= self.capacity {
             return Ok(());
@@ -96,7 +118,10 @@ impl Workspace {
             return Ok(());
         }
         let most = (gpu.max_storage_bytes() / PAIR_GRADIENT_BYTES) as usize;
-        let capacity = (needed + needed / 4).min(most).max(needed);
+        self.grow_pairs(gpu, (needed + needed / 4).min(most).max(needed))
+    }
+
+    fn grow_pairs(&mut self, gpu: &Gpu, capacity: usize) -> Result<(), GpuError> {
         let words = |label: &str| GpuBuffer::storage(gpu, label, capacity as u64 * 4);
         self.tile_keys = [words("tile keys")?, words("tile keys")?];
         self.slots = [words("slots")?, words("slots")?];
@@ -112,15 +137,15 @@ impl Workspace {
         Ok(())
     }
 
-    pub(super) fn reserve_image(&mut self, gpu: &Gpu, view: &View) -> Result<(), GpuError> {
-        if view.tiles() > self.tiles {
-            self.ranges = GpuBuffer::storage(gpu, "ranges", u64::from(view.tiles()) * 8)?;
-            self.tiles = view.tiles();
+    pub(super) fn reserve_image(&mut self, gpu: &Gpu, (pixels, tiles): (u32, u32)) -> Result<(), GpuError> {
+        if tiles > self.tiles {
+            self.ranges = GpuBuffer::storage(gpu, "ranges", u64::from(tiles) * 8)?;
+            self.tiles = tiles;
         }
-        if view.pixels() > self.pixels {
-            self.color_depth = GpuBuffer::storage(gpu, "rendered", u64::from(view.pixels()) * 16)?;
-            self.state = GpuBuffer::storage(gpu, "rendered state", u64::from(view.pixels()) * 8)?;
-            self.pixels = view.pixels();
+        if pixels > self.pixels {
+            self.color_depth = GpuBuffer::storage(gpu, "rendered", u64::from(pixels) * 16)?;
+            self.state = GpuBuffer::storage(gpu, "rendered state", u64::from(pixels) * 8)?;
+            self.pixels = pixels;
         }
         Ok(())
     }

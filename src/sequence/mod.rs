@@ -235,6 +235,9 @@ pub enum SequenceError {
     Groundtruth(#[from] TrajectoryError),
 }
 
+/// Depth that some sensors write where they measured nothing, beside 0 (Kinect's own driver does, hence 7-Scenes).
+const NOT_MEASURED: u16 = u16::MAX;
+
 impl Sequence {
     /// Opens a recording, a folder or a video: finds its layout unless named, reads and checks its lists, camera and truth. No image is
     /// decoded, but a video is, once, for the times of its frames.
@@ -335,7 +338,11 @@ impl Sequence {
         Ok(DepthImage {
             width,
             height,
-            metres: raw.into_raw().into_iter().map(|units| f32::from(units) * metres_per_unit).collect(),
+            metres: raw
+                .into_raw()
+                .into_iter()
+                .map(|units| if units == NOT_MEASURED { 0.0 } else { f32::from(units) * metres_per_unit })
+                .collect(),
         })
     }
 

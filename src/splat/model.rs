@@ -1,6 +1,8 @@
 //! What rendering a Gaussian means: the constants of the splatting model and the camera of a view, shared by the rasterizer and its
 //! oracle.
 
+use serde::{Deserialize, Serialize};
+
 use crate::geometry::{Pinhole, Se3};
 
 /// Alpha below which a Gaussian does not touch a pixel: half a step of an 8-bit image, as in 3DGS.
@@ -20,7 +22,7 @@ pub const MIN_QUATERNION_NORM_SQUARED: f64 = 1e-8;
 pub const TANGENT_MARGIN: f64 = 0.15;
 
 /// A camera to render from.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ViewCamera {
     pub pinhole: Pinhole,
     pub camera_from_world: Se3,

@@ -2,13 +2,15 @@
 //!
 //! Each epoch draws every keyframe once, in a seeded shuffle. Rates fall exponentially, as 3DGS has it for positions.
 
+use serde::{Deserialize, Serialize};
+
 use crate::mapping::RefineConfig;
 use crate::optimise::AdamConfig;
 
 use super::{BATCH, Mapper, MappingError, Step};
 
 /// Where a refinement stands; begun by [`Mapper::begin_refinement`].
-#[derive(Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Refinement {
     config: RefineConfig,
     /// Rates at the beginning.

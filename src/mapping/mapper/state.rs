@@ -1,0 +1,76 @@
+//! A mapper's state, to go on elsewhere to the bit. The keyframes' images are left out: they come again with the recording.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use fastrand::Rng;
+use serde::{Deserialize, Serialize};
+
+use super::{Mapper, MappingError, Refinement};
+use crate::gpu::Gpu;
+use crate::mapping::keyframe::{KeyframeState, MappedKeyframe};
+use crate::mapping::ledger::Ledger;
+use crate::mapping::{Keyframe, MappingConfig};
+use crate::optimise::OptimiserState;
+use crate::render::{CloudState, GpuCloud, Room};
+
+/// Between two keyframes, or between two rounds of a refinement.
+#[derive(Debug, Serialize, Deserialize)]
+pub struct MapperState {
+    cloud: CloudState,
+    room: Room,
+    optimiser: OptimiserState,
+    ledger: Ledger,
+    keyframes: Vec<KeyframeState>,
+    rng: u64,
+    step_times: Vec<Duration>,
+    refinement: Option<Refinement>,
+}
+
+impl Mapper {
+    /// The state, and where the refinement stands if it has begun.
+    pub fn state(&self, refinement: Option<&Refinement>) -> Result<MapperState, MappingError> {
+        Ok(MapperState {
+            cloud: self.cloud.state(&self.gpu)?,
+            room: self.rasterizer.room(),
+            optimiser: self.optimiser.state(),
+            ledger: self.ledger.clone(),
+            keyframes: self.keyframes.iter().map(|keyframe| keyframe.state(&self.gpu)).collect::<Result<_, _>>()?,
+            rng: self.rng.get_seed(),
+            step_times: self.step_times.clone(),
+            refinement: refinement.cloned(),
+        })
+    }
+
+    /// The mapper of a state, without its keyframes: see [`Self::insert_again`].
+    pub fn restore(gpu: Arc<Gpu>, config: &MappingConfig, state: &MapperState) -> Result<Self, MappingError> {
+        let mut mapper = Self::new(gpu, config)?;
+        mapper.cloud = GpuCloud::restore(&mapper.gpu, config.sh_degree, &state.cloud)?.ok_or(MappingError::State)?;
+        if state.ledger.entries().len() != mapper.cloud.len() {
+            return Err(MappingError::State);
+        }
+        mapper.rasterizer.make(state.room)?;
+        mapper.optimiser.restore(&mapper.gpu, &state.optimiser)?;
+        mapper.ledger = state.ledger.clone();
+        mapper.rng = Rng::with_seed(state.rng);
+        mapper.step_times = state.step_times.clone();
+        Ok(mapper)
+    }
+
+    /// Takes in the next keyframe of the state that the mapper was restored from, as it was then, and nothing else happens.
+    pub fn insert_again(&mut self, keyframe: &Keyframe, state: &MapperState) -> Result<(), MappingError> {
+        let not_the_same = || MappingError::NotTheSame { id: keyframe.id };
+        let then = state.keyframes.get(self.keyframes.len()).filter(|then| then.id == keyframe.id).ok_or_else(not_the_same)?;
+        let with_half = self.config.learns_at_half_size();
+        let mapped = MappedKeyframe::restore(&self.gpu, then, keyframe, with_half)?;
+        self.keyframes.push(mapped.ok_or_else(not_the_same)?);
+        Ok(())
+    }
+}
+
+impl MapperState {
+    /// Where the refinement stands, if it has begun.
+    pub fn into_refinement(self) -> Option<Refinement> {
+        self.refinement
+    }
+}

@@ -1,0 +1,250 @@
+//! Runs that were killed and go on from their checkpoint end as if nothing had happened, to the byte; what cannot go on says why.
+
+mod common;
+
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::sync::OnceLock;
+use std::time::{Duration, Instant};
+
+use common::recording::{
+    Finished, change_line, color_file, copy_folder, copy_of_recording, finish, keysplat, metrics, recording, run_command,
+    scratch, skipped_without_adapter, truncate,
+};
+
+/// A keyframe for nearly each frame, so that there are many moments between two.
+const KEYFRAMES: [&str; 4] = ["--set", "tracking.keyframe_translation=0.02", "--set", "mapping.iterations_per_keyframe=10"];
+/// No run here takes longer.
+const HANGS_AFTER: Duration = Duration::from_secs(180);
+
+fn checkpoint(out: &Path) -> PathBuf {
+    out.join("checkpoint.bin")
+}
+
+fn keeping(recording: &Path, out: &Path, more: &[&str]) -> Command {
+    run_command(recording, out, &[&KEYFRAMES[..], &["--checkpoint-every", "1"], more].concat())
+}
+
+fn resume(out: &Path) -> Command {
+    keysplat([Path::new("resume"), out])
+}
+
+/// An unbroken run without checkpoints.
+fn unbroken(name: &str, recording: &Path, more: &[&str]) -> PathBuf {
+    let out = scratch().join(name);
+    finish(run_command(recording, &out, &[&KEYFRAMES[..], more].concat())).succeeded();
+    assert!(!checkpoint(&out).exists());
+    out
+}
+
+/// What tells a checkpoint from the one before it.
+fn written(out: &Path) -> Option<std::time::SystemTime> {
+    std::fs::metadata(checkpoint(out)).and_then(|file| file.modified()).ok()
+}
+
+/// Starts a command and waits until `count` further checkpoints have been seen.
+fn started(mut command: Command, out: &Path, count: usize) -> Child {
+    let mut last = written(out);
+    let mut child = command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+    let (began, mut seen) = (Instant::now(), 0);
+    while seen < count {
+        assert!(child.try_wait().unwrap().is_none(), "it ended before its checkpoint {count}");
+        assert!(began.elapsed() < HANGS_AFTER, "no checkpoint");
+        let now = written(out);
+        seen += usize::from(now.is_some() && now != last);
+        last = now;
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    child
+}
+
+/// Kills a command once `count` further checkpoints have been seen, and then some milliseconds later.
+fn killed(command: Command, out: &Path, (count, later_ms): (usize, u64)) {
+    let mut child = started(command, out, count);
+    std::thread::sleep(Duration::from_millis(later_ms));
+    child.kill().unwrap();
+    assert!(!child.wait().unwrap().success(), "it ended before it was killed");
+    assert!(checkpoint(out).exists());
+}
+
+/// Everything that a run decides is the same in both folders, and nothing else is there.
+fn assert_same_run(a: &Path, b: &Path) {
+    let read = |out: &Path, file: &str| std::fs::read(out.join(file)).unwrap();
+    for file in ["trajectory.txt", "keyframes.txt", "map.ply", "trajectory.svg", "views/000007.png"] {
+        assert!(read(a, file) == read(b, file), "{file} differs");
+    }
+    let decided = |out: &Path| {
+        let m = metrics(out);
+        (m.map_hash, m.config_hash, m.ate_rmse_m, m.images, m.gaussians, m.keyframes, m.mapping.unwrap().iterations)
+    };
+    assert_eq!(decided(a), decided(b));
+    let reports = |out: &Path| {
+        let history: serde_json::Value = serde_json::from_slice(&read(out, "history.json")).unwrap();
+        let keyframes = history["keyframes"].as_array().unwrap().clone();
+        keyframes
+            .into_iter()
+            .map(|mut keyframe| {
+                ["done_s", "busy_s", "waiting"].iter().for_each(|time| keyframe[*time] = 0.into());
+                keyframe
+            })
+            .collect::<Vec<_>>()
+    };
+    assert_eq!(reports(a), reports(b));
+    let names = |out: &Path| {
+        let mut names: Vec<_> = std::fs::read_dir(out).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+        names.sort();
+        names
+    };
+    assert_eq!(names(a), names(b));
+}
+
+/// Killed between two checkpoints, again while it catches up, and again later, the run ends as it would have.
+fn survives(name: &str, more: &[&str], checkpoints: usize) {
+    let whole = unbroken(&format!("{name}-whole"), recording(), more);
+    let out = scratch().join(name);
+    killed(keeping(recording(), &out, more), &out, (checkpoints, 20));
+    killed(resume(&out), &out, (0, 400));
+    killed(resume(&out), &out, (2, 0));
+    let said = finish(resume(&out)).succeeded();
+    assert!(said.stderr.contains("caught up with the checkpoint"), "{}", said.stderr);
+    assert_same_run(&out, &whole);
+}
+
+#[test]
+fn a_killed_run_ends_as_the_unbroken_one() {
+    if !skipped_without_adapter() {
+        survives("killed", &[], 3);
+    }
+}
+
+/// The mapper then talks back to the tracker, counts every byte that it uses, and has given images back.
+#[test]
+fn what_the_tracker_was_told_and_what_memory_allows_comes_again() {
+    if skipped_without_adapter() {
+        return;
+    }
+    let settings = ["tracking.keyframe_translation=0.005", "mapping.refine_poses.enabled=true", "mapping.limits.max_keyframes=8"];
+    let more: Vec<&str> = settings.iter().flat_map(|s| ["--set", s]).chain(["--max-gpu-memory", "20M"]).collect();
+    survives("told", &more, 11);
+    let whole = metrics(&scratch().join("told-whole"));
+    assert!(whole.keyframes > Some(12) && whole.gaussians < Some(4000), "neither limit matters: {whole}");
+}
+
+#[test]
+fn a_refinement_goes_on_where_it_stood() {
+    if skipped_without_adapter() {
+        return;
+    }
+    let refine = ["--known-poses", "--set", "mapping.refine.steps=60", "--set", "mapping.refine.density_every=15"];
+    let whole = unbroken("refined-whole", recording(), &refine);
+    let keyframes = metrics(&whole).keyframes.unwrap() as usize;
+    let out = scratch().join("refined");
+    // The first checkpoint comes before any keyframe, and a round follows them.
+    killed(keeping(recording(), &out, &refine), &out, (keyframes + 2, 0));
+    finish(resume(&out)).succeeded();
+    assert_same_run(&out, &whole);
+}
+
+#[cfg(unix)]
+#[test]
+fn what_ctrl_c_ended_early_can_go_on() {
+    if skipped_without_adapter() {
+        return;
+    }
+    let whole = unbroken("stopped-whole", recording(), &[]);
+    let out = scratch().join("stopped");
+    let mut child = started(keeping(recording(), &out, &[]), &out, 3);
+    assert!(Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap().success());
+    assert!(child.wait().unwrap().success());
+    assert!(metrics(&out).keyframes < metrics(&whole).keyframes && checkpoint(&out).exists());
+    finish(resume(&out)).succeeded();
+    assert_same_run(&out, &whole);
+}
+
+/// A run that was killed after its third keyframe; tests only copy it.
+fn interrupted() -> &'static Path {
+    static OUT: OnceLock<PathBuf> = OnceLock::new();
+    OUT.get_or_init(|| {
+        let (copy, out) = (copy_of_recording("theirs"), scratch().join("interrupted"));
+        killed(keeping(&copy, &out, &[]), &out, (4, 0));
+        out
+    })
+}
+
+/// Resumes a copy of the interrupted run after `spoil` had it; the checkpoint stays as it is.
+fn resumed_after(name: &str, spoil: impl FnOnce(&Path)) -> Finished {
+    let out = scratch().join(name);
+    copy_folder(interrupted(), &out);
+    spoil(&out);
+    let before = std::fs::read(checkpoint(&out)).unwrap();
+    let said = finish(resume(&out));
+    assert!(std::fs::read(checkpoint(&out)).unwrap() == before);
+    assert!(!out.join("trajectory.txt").exists());
+    said
+}
+
+#[test]
+fn a_damaged_checkpoint_is_refused() {
+    if skipped_without_adapter() {
+        return;
+    }
+    let damaged = |name: &str, spoil: fn(&Path)| {
+        let said = resumed_after(name, |out| spoil(&checkpoint(out)));
+        said.refused(&[checkpoint(&scratch().join(name)).to_str().unwrap(), "damaged or cut off", "keysplat run"]);
+    };
+    damaged("empty", |file| truncate(file, 0));
+    damaged("cut-off", |file| truncate(file, std::fs::metadata(file).unwrap().len() - 1));
+    damaged("flipped", |file| {
+        let mut bytes = std::fs::read(file).unwrap();
+        let middle = bytes.len() / 2;
+        bytes[middle] ^= 1;
+        std::fs::write(file, bytes).unwrap();
+    });
+}
+
+#[test]
+fn another_recording_is_refused() {
+    if skipped_without_adapter() {
+        return;
+    }
+    // One after the other: they change the recording of the interrupted run.
+    interrupted();
+    let theirs = scratch().join("theirs");
+    let list = theirs.join("rgb.txt");
+    let original = std::fs::read_to_string(&list).unwrap();
+    let shorter = original.lines().take(original.lines().count() - 2).map(|line| format!("{line}\n")).collect::<String>();
+    std::fs::write(&list, shorter).unwrap();
+    resumed_after("shorter", |_| ()).refused(&["checkpoint.bin is of another run", "number of frames was 24 and is 22"]);
+    std::fs::write(&list, &original).unwrap();
+    change_line(&list, 9, |line| line.replacen(' ', "1 ", 1));
+    resumed_after("later", |_| ()).refused(&["checkpoint.bin is of another run", "camera or times"]);
+    std::fs::write(&list, &original).unwrap();
+    let image = color_file(&theirs, 0);
+    let mut picture = image::open(&image).unwrap().into_rgb8();
+    picture.get_pixel_mut(0, 0).0[0] ^= 1;
+    picture.save(&image).unwrap();
+    resumed_after("a-bit", |_| ()).refused(&["checkpoint.bin cannot be resumed", "put the recording back"]);
+}
+
+#[test]
+fn what_is_finished_or_was_never_begun_says_so() {
+    if skipped_without_adapter() {
+        return;
+    }
+    let out = unbroken("finished", recording(), &[]);
+    let map = std::fs::metadata(out.join("map.ply")).unwrap().modified().unwrap();
+    let said = finish(resume(&out)).succeeded();
+    assert!(said.stdout.contains("finished; there is nothing to resume"), "{said:?}");
+    assert_eq!(std::fs::metadata(out.join("map.ply")).unwrap().modified().unwrap(), map);
+    finish(resume(&scratch().join("nowhere"))).refused(&["there is no", "checkpoint.bin", "--checkpoint-every"]);
+}
+
+#[test]
+fn runs_that_do_not_repeat_keep_no_checkpoints() {
+    let out = scratch().join("never");
+    for more in [&["--paced"][..], &["--budget", "realtime"], &["--set", "mapping.yields_to_keyframes=true"]] {
+        finish(keeping(recording(), &out, more)).refused(&["cannot be resumed", "--checkpoint-every", "--paced"]);
+    }
+    finish(run_command(recording(), &out, &["--checkpoint-every", "0"])).refused(&["checkpoint_every must be at least 1"]);
+    assert!(!out.exists());
+}
