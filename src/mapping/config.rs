@@ -145,7 +145,7 @@ impl Default for SeedingConfig {
             detail: 0.05,
             min_alpha: 0.6,
             depth_disagreement: 0.06,
-            missed_detail: 0.06,
+            missed_detail: 0.08,
             footprint: 0.55,
             thickness: 1.0,
             opacity: 0.7,

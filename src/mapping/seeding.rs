@@ -305,6 +305,23 @@ mod tests {
     }
 
     #[test]
+    fn a_spot_that_the_render_lacks_is_missed_detail_and_another_brightness_is_not() {
+        let spot = |x: u32, y: u32| (8..10).contains(&x) && (12..14).contains(&y);
+        let image = RgbImage::from_fn(32, 24, |x, y| Rgb([if spot(x, y) { 200 } else { 90 }; 3]));
+        let rendered =
+            Rendered { width: 32, height: 24, color_depth: vec![[0.2, 0.2, 0.2, 1.0]; 32 * 24], transmittance: vec![0.0; 32 * 24] };
+        let missed = Missed::new(&image, &rendered);
+        let response = |x, y| missed.response(Block { x, y, size: 2 });
+        assert!(response(8, 12) > 0.3, "{}", response(8, 12));
+        assert!([(0, 0), (20, 12), (30, 22)].into_iter().all(|(x, y)| response(x, y) < 1e-3));
+        let frame = keyframe(image, vec![1.0; 32 * 24]);
+        let config = SeedingConfig { missed_detail: 0.1, ..SeedingConfig::default() };
+        let cloud = seed(&frame, Some(&rendered), &config, ShDegree::default());
+        let columns: Vec<f32> = cloud.means.iter().map(|m| m.x * 30.0 + 15.5).collect();
+        assert!(!columns.is_empty() && columns.iter().all(|c| (6.0..13.0).contains(c)), "{columns:?}");
+    }
+
+    #[test]
     fn holes_take_the_farther_side_and_interpolate_a_slope() {
         let mut metres = vec![0.0; 9];
         (metres[0], metres[8]) = (1.0, 3.0);

@@ -46,7 +46,9 @@ impl Budget {
                 "mapping.window.covisible=2",
             ],
             Self::Balanced => &[],
-            Self::Quality => &["mapping.iterations_per_keyframe=100", "mapping.seeding.detail=0.04"],
+            Self::Quality => {
+                &["mapping.iterations_per_keyframe=100", "mapping.seeding.detail=0.04", "mapping.density.vcd.min_worth=0.5"]
+            }
         }
     }
 

@@ -91,7 +91,7 @@ impl Default for VcdConfig {
             max_growth: 0.03,
             min_age: 2,
             min_weight: 0.02,
-            min_worth: 2.0,
+            min_worth: 1.5,
             faint_opacity: 0.1,
         }
     }

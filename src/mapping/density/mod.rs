@@ -165,15 +165,16 @@ mod tests {
     fn what_is_never_seen_and_what_went_bad_goes() {
         let config = DensityConfig::default();
         let hidden = Candidate { entry: Entry { best_weight: 0.001, ..good().entry }, ..good() };
+        let speck = Candidate { entry: Entry { worth: 0.5, ..good().entry }, ..good() };
         let new = Candidate { entry: Entry::default(), ..hidden };
         let nan = Candidate { mean: Vec3::NAN, ..good() };
         let faint = Candidate { raw_opacity: raw_opacity_from_opacity(0.01), ..good() };
         let huge = Candidate { log_scale: Vec3::splat(4.0), ..good() };
-        let all = [good(), hidden, new, nan, faint, huge];
+        let all = [good(), hidden, new, nan, faint, huge, speck];
         assert_eq!(plan(&all, 100, &config).keep, [0, 2]);
         // Without control of density only what went bad goes.
         let none = DensityConfig { strategy: DensityStrategy::None, ..config };
-        assert_eq!(plan(&all, 100, &none).keep, [0, 1, 2]);
+        assert_eq!(plan(&all, 100, &none).keep, [0, 1, 2, 6]);
     }
 
     #[test]
