@@ -20,15 +20,17 @@ use crate::reference::{Gaussian64, cloud64};
 use crate::splat::{Gaussian, GaussianCloud, ShDegree};
 
 const STEPS: usize = 60;
-/// How many times the control's difference, and beyond that how much of what the parameters travelled, a moved run may differ.
+/// How many times the control's difference, and beyond that how much of what the parameters travelled, a moved run may differ. Controls are
+/// 1e-4 off as a rule and 1e-2 at times, where a pair at a cut-off goes the other way early; a wrong exponent of the size would be 1.
 const CONTROL_FACTOR: f64 = 5.0;
-const TRAVEL_SHARE: f64 = 3e-3;
+const TRAVEL_SHARE: f64 = 2e-2;
 /// One case in so many.
 const EVERY: usize = 10;
 /// A gradient's largest difference, of its largest magnitude: pairs at the cut-off of 1/255 come and go with a rounding.
 const GRADIENT_LIMIT: f64 = 1e-2;
-/// How much better or worse than at home a map may fit that was turned by any angle: each path through 60 steps is one of many.
-const LOSS_LIMIT: f64 = 0.3;
+/// How much better or worse than at home a map may fit that was turned by any angle: each path through 60 steps is one of many, and the
+/// loss has fallen to a sixth.
+const LOSS_LIMIT: f64 = 1.0;
 
 pub fn families(machine: &Machine) -> Vec<Family<'_>> {
     let family = |name: &str, motion: fn(&mut Rng) -> (Se3, f64), expected: Expected| {
