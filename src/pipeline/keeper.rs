@@ -77,6 +77,11 @@ impl Checkpoints {
         self.earlier_s
     }
 
+    /// Whether there is a checkpoint to catch up with.
+    pub(super) fn is_behind(&self) -> bool {
+        self.from.is_some()
+    }
+
     /// The mapper takes this message.
     pub(super) fn hear(&mut self, message: &MapperMessage) {
         self.heard.hear(message);

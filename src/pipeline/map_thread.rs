@@ -44,10 +44,11 @@ pub(super) fn map(
     (progress, on_round): (&Progress, &mut dyn FnMut(Round<'_>)),
     mut checkpoints: Option<Checkpoints>,
 ) -> MapSummary {
+    let behind = checkpoints.as_ref().is_some_and(Checkpoints::is_behind);
     let begun = guarded("mapping", || begin(gpu, config, (messages, tracker), checkpoints.as_mut()));
     let (Resumed { mut mapper, refinement, records }, cloud) = match begun {
         Ok(begun) => begun,
-        Err(error) => return MapSummary { behind: checkpoints.is_some(), error: Some(error), ..MapSummary::default() },
+        Err(error) => return MapSummary { behind, error: Some(error), ..MapSummary::default() },
     };
     let earlier_s = records.last().map_or(0.0, |record| record.done_s);
     let mut summary = MapSummary { cloud, keyframes: records, ..MapSummary::default() };
