@@ -308,8 +308,12 @@ mod tests {
     fn a_spot_that_the_render_lacks_is_missed_detail_and_another_brightness_is_not() {
         let spot = |x: u32, y: u32| (8..10).contains(&x) && (12..14).contains(&y);
         let image = RgbImage::from_fn(32, 24, |x, y| Rgb([if spot(x, y) { 200 } else { 90 }; 3]));
-        let rendered =
-            Rendered { width: 32, height: 24, color_depth: vec![[0.2, 0.2, 0.2, 1.0]; 32 * 24], transmittance: vec![0.0; 32 * 24] };
+        let rendered = Rendered {
+            width: 32,
+            height: 24,
+            color_depth: vec![[0.2, 0.2, 0.2, 1.0]; 32 * 24],
+            transmittance: vec![0.0; 32 * 24],
+        };
         let missed = Missed::new(&image, &rendered);
         let response = |x, y| missed.response(Block { x, y, size: 2 });
         assert!(response(8, 12) > 0.3, "{}", response(8, 12));
