@@ -38,7 +38,8 @@ fn a_report_holds_everything_itself() {
         assert!(page.contains(needed), "no {needed}");
     }
     assert!(!page.contains("<!--"), "a placeholder was left");
-    assert_eq!(page.matches("<svg").count(), 8);
+    // One fewer where the system does not tell how much memory a process has.
+    assert_eq!(page.matches("<svg").count(), if cfg!(target_os = "linux") { 9 } else { 8 });
     assert_eq!(page.matches("data:image/png;base64,").count(), 3);
     // What would be loaded from elsewhere.
     let outside = ["src=\"", "href=\"", "@import", "url(http"];

@@ -84,7 +84,7 @@ fn assert_same_run(a: &Path, b: &Path) {
         keyframes
             .into_iter()
             .map(|mut keyframe| {
-                ["done_s", "busy_s", "waiting"].iter().for_each(|time| keyframe[*time] = 0.into());
+                ["done_s", "busy_s", "waiting", "host_bytes"].iter().for_each(|time| keyframe[*time] = 0.into());
                 keyframe
             })
             .collect::<Vec<_>>()
