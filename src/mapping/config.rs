@@ -263,6 +263,7 @@ impl MappingConfig {
             ("refine.final_position_rate", self.refine.final_position_rate),
             ("refine.final_rate", self.refine.final_rate),
             ("seeding.depth_disagreement", s.depth_disagreement),
+            ("seeding.missed_detail", s.missed_detail),
             ("seeding.footprint", s.footprint),
             ("seeding.thickness", s.thickness),
             ("seeding.opacity", s.opacity),

@@ -40,8 +40,8 @@ impl Default for PlaneSweepConfig {
 impl PlaneSweepConfig {
     /// Says what is wrong with the values, if anything.
     pub(super) fn validate(&self) -> Result<(), String> {
-        if !(8..=256).contains(&self.planes) || self.views == 0 {
-            return Err("planes must lie between 8 and 256, and views be at least 1".into());
+        if !(8..=256).contains(&self.planes) || !(1..=MOST_VIEWS).contains(&self.views) {
+            return Err(format!("planes must lie between 8 and 256, and views between 1 and {MOST_VIEWS}"));
         }
         if !(self.uniqueness >= 1.0 && self.min_parallax_pixels >= 0.0 && (0.0..=1.0).contains(&self.min_agreement)) {
             return Err("uniqueness must be at least 1, min_parallax_pixels positive, min_agreement between 0 and 1".into());
@@ -57,6 +57,8 @@ pub(super) struct SourceView<'a> {
     pub gray: &'a GrayImage,
 }
 
+/// A pixel's costs are held side by side, one a view.
+const MOST_VIEWS: usize = 8;
 /// Landmarks nearer to their estimate than this share of their depth are met.
 const MET: f32 = 0.1;
 /// Inverse depths that are searched reach beyond the landmarks' by these factors.
@@ -180,9 +182,9 @@ fn matching_costs(view: &SourceView<'_>, others: &[Source], inverse_depths: &[f3
             let code = own[y * width + x];
             let turned: Vec<[f32; 3]> = others.iter().map(|source| source.rotation.map(|row| row.dot(&ray))).collect();
             for (cost, inverse_depth) in costs.iter_mut().zip(inverse_depths) {
-                let mut seen = [u8::MAX; 8];
+                let mut seen = [u8::MAX; MOST_VIEWS];
                 let mut count = 0;
-                for (source, turned) in others.iter().zip(&turned).take(seen.len()) {
+                for (source, turned) in others.iter().zip(&turned) {
                     if let Some(other) = source.at(*turned, *inverse_depth) {
                         seen[count] = (code ^ other).count_ones() as u8;
                         count += 1;

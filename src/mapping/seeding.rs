@@ -115,39 +115,59 @@ struct Block {
     size: u32,
 }
 
-/// Sums over the pixels above and left of each corner, `[H + 1, W + 1]`: the channels, and the squares of all three (8-bit values).
-struct ColorSums {
+/// Sums of `N` values over the pixels above and left of each corner, `[H + 1, W + 1]`, so that those over any rectangle cost four reads.
+struct Sums<const N: usize> {
     width: u32,
     height: u32,
-    sums: Vec<[u64; 4]>,
+    sums: Vec<[f64; N]>,
 }
 
-impl ColorSums {
-    fn new(image: &RgbImage) -> Self {
-        let (width, height) = image.dimensions();
+impl<const N: usize> Sums<N> {
+    /// Of values that come row by row.
+    fn new((width, height): (u32, u32), values: impl Iterator<Item = [f64; N]>) -> Self {
         let row = width as usize + 1;
-        let mut sums = vec![[0; 4]; row * (height as usize + 1)];
-        for (x, y, pixel) in image.enumerate_pixels() {
-            let [r, g, b] = pixel.0.map(u64::from);
-            let own = [r, g, b, r * r + g * g + b * b];
-            let at = (y as usize + 1) * row + x as usize + 1;
+        let mut sums = vec![[0.0; N]; row * (height as usize + 1)];
+        for (i, own) in values.enumerate() {
+            let at = (i / width as usize + 1) * row + i % width as usize + 1;
             sums[at] = std::array::from_fn(|k| own[k] + sums[at - 1][k] + sums[at - row][k] - sums[at - row - 1][k]);
         }
         Self { width, height, sums }
+    }
+
+    /// Means over the part of a rectangle that is on the image, from its first corner to before its last.
+    fn means(&self, (x0, y0): (u32, u32), (x1, y1): (u32, u32)) -> [f64; N] {
+        let (x1, y1) = (x1.min(self.width), y1.min(self.height));
+        let at = |x: u32, y: u32| self.sums[y as usize * (self.width as usize + 1) + x as usize];
+        let (a, b, c, d) = (at(x0, y0), at(x1, y0), at(x0, y1), at(x1, y1));
+        let pixels = f64::from((x1 - x0) * (y1 - y0));
+        std::array::from_fn(|k| (d[k] + a[k] - b[k] - c[k]) / pixels)
+    }
+}
+
+/// The channels of an image, and the squares of all three together (8-bit values).
+struct ColorSums(Sums<4>);
+
+impl ColorSums {
+    fn new(image: &RgbImage) -> Self {
+        let values = image.pixels().map(|pixel| {
+            let [r, g, b] = pixel.0.map(f64::from);
+            [r, g, b, r * r + g * g + b * b]
+        });
+        Self(Sums::new(image.dimensions(), values))
     }
 
     /// Blocks that cover the image: quartered while their colours deviate more than noise does, but not below the stride.
     fn blocks(&self, config: &SeedingConfig) -> Vec<Block> {
         let size = config.flat_stride;
         let corners =
-            (0..self.height).step_by(size as usize).flat_map(|y| (0..self.width).step_by(size as usize).map(move |x| (x, y)));
+            (0..self.0.height).step_by(size as usize).flat_map(|y| (0..self.0.width).step_by(size as usize).map(move |x| (x, y)));
         let mut blocks = Vec::new();
         let mut open: Vec<Block> = corners.map(|(x, y)| Block { x, y, size }).collect();
         while let Some(block) = open.pop() {
             if block.size >= 2 * config.stride && self.deviation(block) > config.detail {
                 let half = block.size / 2;
                 let quarters = [(0, 0), (half, 0), (0, half), (half, half)].map(|(dx, dy)| (block.x + dx, block.y + dy));
-                let inside = quarters.into_iter().filter(|(x, y)| *x < self.width && *y < self.height);
+                let inside = quarters.into_iter().filter(|(x, y)| *x < self.0.width && *y < self.0.height);
                 open.extend(inside.map(|(x, y)| Block { x, y, size: half }));
             } else {
                 blocks.push(block);
@@ -157,48 +177,28 @@ impl ColorSums {
     }
 
     /// Standard deviation of the colours about their mean over the part of a block that is on the image, 0 to 1, mean over the channels.
-    fn deviation(&self, block: Block) -> f32 {
-        let (x1, y1) = ((block.x + block.size).min(self.width), (block.y + block.size).min(self.height));
-        let at = |x: u32, y: u32| self.sums[y as usize * (self.width as usize + 1) + x as usize];
-        let (a, b, c, d) = (at(block.x, block.y), at(x1, block.y), at(block.x, y1), at(x1, y1));
-        let sum: [f64; 4] = std::array::from_fn(|k| (d[k] + a[k] - b[k] - c[k]) as f64);
-        let pixels = f64::from((x1 - block.x) * (y1 - block.y));
-        let variance = (sum[3] - (sum[0] * sum[0] + sum[1] * sum[1] + sum[2] * sum[2]) / pixels) / (3.0 * pixels);
+    fn deviation(&self, Block { x, y, size }: Block) -> f32 {
+        let [r, g, b, squares] = self.0.means((x, y), (x + size, y + size));
+        let variance = (squares - (r * r + g * g + b * b)) / 3.0;
         variance.max(0.0).sqrt() as f32 / 255.0
     }
 }
 
-/// What the render misses: the brightness of image minus render, summed over the pixels above and left of each corner, `[H + 1, W + 1]`.
-struct Missed {
-    width: u32,
-    height: u32,
-    sums: Vec<f64>,
-}
+/// What the render misses: the brightness of image minus render.
+struct Missed(Sums<1>);
 
 impl Missed {
     fn new(image: &RgbImage, rendered: &Rendered) -> Self {
-        let (width, height) = image.dimensions();
-        let row = width as usize + 1;
-        let mut sums = vec![0.0; row * (height as usize + 1)];
-        for ((x, y, pixel), render) in image.enumerate_pixels().zip(&rendered.color_depth) {
-            let missed = (0..3).map(|k| f64::from(pixel[k]) / 255.0 - f64::from(render[k])).sum::<f64>() / 3.0;
-            let at = (y as usize + 1) * row + x as usize + 1;
-            sums[at] = missed + sums[at - 1] + sums[at - row] - sums[at - row - 1];
-        }
-        Self { width, height, sums }
-    }
-
-    /// Mean over the part of a rectangle that is on the image, from a corner to another.
-    fn mean(&self, (x0, y0): (u32, u32), (x1, y1): (u32, u32)) -> f64 {
-        let (x1, y1) = (x1.min(self.width), y1.min(self.height));
-        let at = |x: u32, y: u32| self.sums[y as usize * (self.width as usize + 1) + x as usize];
-        (at(x1, y1) + at(x0, y0) - at(x1, y0) - at(x0, y1)) / f64::from((x1 - x0) * (y1 - y0))
+        let missed = |(pixel, render): (&image::Rgb<u8>, &[f32; 4])| {
+            [(0..3).map(|k| f64::from(pixel[k]) / 255.0 - f64::from(render[k])).sum::<f64>() / 3.0]
+        };
+        Self(Sums::new(image.dimensions(), image.pixels().zip(&rendered.color_depth).map(missed)))
     }
 
     /// How a block differs from its surroundings in what is missed: the Laplacian of Gaussian at the block's scale, by boxes.
     fn response(&self, Block { x, y, size }: Block) -> f32 {
-        let around = self.mean((x.saturating_sub(size), y.saturating_sub(size)), (x + 2 * size, y + 2 * size));
-        (self.mean((x, y), (x + size, y + size)) - around).abs() as f32
+        let around = self.0.means((x.saturating_sub(size), y.saturating_sub(size)), (x + 2 * size, y + 2 * size));
+        (self.0.means((x, y), (x + size, y + size))[0] - around[0]).abs() as f32
     }
 }
 

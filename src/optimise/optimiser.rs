@@ -41,7 +41,7 @@ pub struct TrainingView<'a> {
 }
 
 impl<'a> TrainingView<'a> {
-    /// The whole view, for all Gaussians, at full pace.
+    /// The whole view at full pace, not scored.
     pub fn new(camera: ViewCamera, target: &'a TargetImage) -> Self {
         Self { camera, target, scored: None, pace: 1.0, skip: None }
     }
