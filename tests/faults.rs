@@ -2,15 +2,17 @@
 
 mod common;
 
+use std::ffi::OsStr;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use common::recording::{
-    FRAMES, Finished, HEIGHT, WIDTH, color_file, copy_of_recording, finish, metrics, run_command, scratch,
+    FPS, FRAMES, Finished, HEIGHT, WIDTH, color_file, copy_of_recording, finish, keysplat, metrics, run_command, scratch,
     skipped_without_adapter, stamp, stamps, truncate,
 };
 use image::{ImageBuffer, Luma, RgbImage};
-use keysplat::evaluation::Metrics;
+use keysplat::evaluation::metrics::ImageFigures;
+use keysplat::evaluation::{Exposures, Metrics};
 use keysplat::export::MapFormat;
 use keysplat::geometry::Trajectory;
 
@@ -121,6 +123,39 @@ fn black_pictures() {
     let run = Run::of("black", spoil, &[]);
     run.found_again().good_map(19.0).true_poses(0.03);
     assert!(!run.tracked.iter().any(|frame| SPOILT.contains(frame)), "{:?}", run.tracked);
+}
+
+#[test]
+fn a_camera_that_adapts() {
+    if skipped_without_adapter() {
+        return;
+    }
+    // Exposure and white balance: pictures darken, and redden, all the time.
+    let gains = |frame: f64| [0.25, 0.4, 0.5].map(|rate: f64| (-rate * frame / FRAMES as f64).exp());
+    let adapt = |copy: &Path| {
+        for frame in 0..FRAMES {
+            let mut picture = image::open(color_file(copy, frame)).unwrap().into_rgb8();
+            let gains = gains(frame as f64);
+            picture.pixels_mut().for_each(|p| p.0 = std::array::from_fn(|k| (f64::from(p.0[k]) * gains[k]).round() as u8));
+            picture.save(color_file(copy, frame)).unwrap();
+        }
+    };
+    let steps = ["--set", "mapping.first_iterations=60", "--set", "mapping.iterations_per_keyframe=20"];
+    let run = Run::of("adapting", adapt, &steps);
+    run.good_map(19.0).true_poses(0.03);
+    let out = scratch().join("adapting-out");
+    let found = Exposures::parse(&std::fs::read_to_string(out.join("exposures.json")).unwrap()).unwrap();
+    let halfway = found.at(0.5 * FRAMES as f64 / FPS).0.map(f64::from);
+    let truth = gains(0.5 * FRAMES as f64).map(f64::ln);
+    assert!((0..3).all(|k| (0.6..1.2).contains(&(halfway[k] / truth[k]))), "{halfway:?}, and not {truth:?}");
+    let psnr_db = |figures: Option<ImageFigures>| figures.unwrap().psnr_db.unwrap();
+    let images = &run.metrics.images;
+    assert!(psnr_db(images.held_out) > psnr_db(images.held_out_map_colors) + 0.5, "{}", run.metrics);
+
+    finish(keysplat([OsStr::new("eval"), out.as_os_str()])).succeeded();
+    assert!((psnr_db(metrics(&out).images.held_out) - psnr_db(images.held_out)).abs() < 1e-3);
+    std::fs::write(out.join("exposures.json"), "[1, 2]").unwrap();
+    finish(keysplat([OsStr::new("eval"), out.as_os_str()])).refused(&["exposures.json does not hold exposures"]);
 }
 
 /// Nothing measured, and what sensors write where they measured nothing.

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use clap::Args;
 use keysplat::config::{Config, SequenceConfig};
 use keysplat::evaluation::trajectory::MAX_TIME_DIFFERENCE_S;
-use keysplat::evaluation::{Metrics, sha256_hex, write_json};
+use keysplat::evaluation::{Exposures, Metrics, sha256_hex, write_json};
 use keysplat::export::MapFormat;
 use keysplat::geometry::{Se3, Trajectory};
 use keysplat::gpu::Gpu;
@@ -66,6 +66,7 @@ pub fn eval(args: &EvalArgs, verbosity: Verbosity) -> miette::Result<()> {
         keyframe_indices: frames_of(&sequence, &keyframes).into_iter().map(|(index, _)| index).collect::<BTreeSet<usize>>(),
         keyframes,
         cloud: &cloud,
+        exposures: exposures(args)?,
         poses,
     };
     let bar = progress::bar(verbosity, subject.poses.len() as u64, "{wide_bar} {pos}/{len} views compared");
@@ -108,6 +109,18 @@ fn frames_of(sequence: &Sequence, trajectory: &Trajectory) -> Vec<(usize, Se3)> 
             .filter(|(_, difference)| *difference <= MAX_TIME_DIFFERENCE_S)
     };
     trajectory.poses.iter().filter_map(|pose| Some((nearest(pose.timestamp_s)?.0, pose.world_from_camera))).collect()
+}
+
+/// Those of the run, if it has any.
+fn exposures(args: &EvalArgs) -> miette::Result<Exposures> {
+    let path = args.dir.join(outputs::EXPOSURES);
+    if !path.is_file() {
+        return Ok(Exposures::default());
+    }
+    let text = std::fs::read_to_string(&path).into_diagnostic()?;
+    Exposures::parse(&text).ok_or_else(|| {
+        miette::miette!("{} does not hold exposures; move it away to compare with the map's own colours", path.display())
+    })
 }
 
 fn earlier_metrics(args: &EvalArgs) -> miette::Result<Option<Metrics>> {

@@ -298,6 +298,7 @@ fn subject(outcome: &Outcome) -> outputs::Subject<'_> {
         keyframes: outcome.keyframe_trajectory(),
         keyframe_indices: outcome.keyframes.iter().map(|k| k.frame_index).collect(),
         cloud: &outcome.cloud,
+        exposures: outcome.exposures(),
     }
 }
 

@@ -66,12 +66,15 @@ pub struct RpeFigures {
     pub rot_deg_per_frame: Option<f64>,
 }
 
-/// The three protocols by which rendered images are compared with recorded ones.
+/// The three protocols by which rendered images are compared with recorded ones. Those of others have no correction of colours.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ImageProtocols {
-    /// Every 8th frame, which the mapper never saw.
+    /// Every 8th frame, which the mapper never saw; rendered with the exposure that the keyframes around it have, where these are corrected.
     pub held_out: Option<ImageFigures>,
+    /// The same frames rendered in the map's own colours, where exposures are corrected.
+    #[serde(default)]
+    pub held_out_map_colors: Option<ImageFigures>,
     /// Every posed frame (Photo-SLAM).
     pub all_frames: Option<ImageFigures>,
     /// Every 5th frame that is no keyframe, PSNR where the image is lit (MonoGS).
@@ -230,6 +233,7 @@ impl fmt::Display for Metrics {
         row("RPE per frame", format!("{}   {degrees}", cell(self.rpe.trans_m_per_frame.map(|m| 1000.0 * m), 2, "mm")))?;
         for (name, figures) in [
             ("held-out images", self.images.held_out),
+            ("  in the map's colours", self.images.held_out_map_colors),
             ("all images", self.images.all_frames),
             ("images as MonoGS", self.images.monogs),
         ] {
@@ -268,11 +272,12 @@ impl fmt::Display for Adapter {
 mod tests {
     use super::*;
 
-    /// The example of the protocol, field for field, and the two counts of a paced replay that it leaves out.
+    /// The example of the protocol, field for field, and what it leaves out: two counts of a paced replay, the map's own colours.
     const EXAMPLE: &str = r#"{ "sequence": "redkitchen", "sensor": "rgbd", "paced": false, "frames": 600, "frames_read_failed": 0,
       "frames_tracked": 600, "frames_late": 0, "keyframes_deferred": 0, "keyframes": 61,
       "ate_rmse_m": {"all_frames": 0.01, "keyframes": 0.01}, "rpe": {"trans_m_per_frame": 0.002, "rot_deg_per_frame": 0.1},
       "images": {"held_out":   {"count": 75, "psnr_db": 24.0, "ssim": 0.85, "depth_l1_m": 0.02},
+                 "held_out_map_colors": null,
                  "all_frames": {"count": 600, "psnr_db": 24.5, "ssim": 0.86, "depth_l1_m": 0.02},
                  "monogs":     {"count": 110, "psnr_db": 24.1, "ssim": 0.85, "depth_l1_m": 0.02}},
       "gaussians": 60000, "map_bytes": 3000000, "map_hash": "00ff",

@@ -4,6 +4,7 @@
 
 mod comparison;
 mod drawing;
+mod exposures;
 pub mod image;
 pub mod machine;
 pub mod metrics;
@@ -12,6 +13,7 @@ pub mod views;
 
 pub use comparison::{Comparison, PoseRecord};
 pub use drawing::draw_trajectory;
+pub use exposures::{ExposureRecord, Exposures};
 pub use image::{ImageError, ImageF32, depth_l1, psnr, psnr_where_lit, ssim};
 pub use metrics::{Metrics, Times, sha256_hex, write_json};
 pub use trajectory::{Alignment, AlignmentError, TrajectoryErrors, evaluate_trajectory};

@@ -9,6 +9,7 @@ use image::{Rgb, RgbImage};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
+use super::Exposures;
 use super::image::{ImageF32, depth_l1, psnr, psnr_where_lit, ssim};
 use super::metrics::{ImageMeans, ImageProtocols};
 use crate::geometry::Se3;
@@ -30,6 +31,8 @@ pub struct ViewSelection<'a> {
     /// Frame indices of keyframes.
     pub keyframes: &'a BTreeSet<usize>,
     pub is_held_out: &'a (dyn Fn(usize) -> bool + Sync),
+    /// The camera's over time, by the keyframes alone: renders of held-out views get them before they are compared.
+    pub exposures: &'a Exposures,
 }
 
 /// One held-out view beside what was recorded.
@@ -71,7 +74,7 @@ pub fn evaluate_views(
     let mut rasterizer = Rasterizer::new(gpu.clone())?;
     let mut on_gpu = GpuCloud::new(gpu, cloud.sh_degree, cloud.len())?;
     on_gpu.append(gpu, cloud)?;
-    let [mut held_out, mut all_frames, mut monogs] = [ImageMeans::default(); 3];
+    let [mut held_out, mut map_colors, mut all_frames, mut monogs] = [ImageMeans::default(); 4];
     for (batch, poses) in selection.poses.chunks(BATCH).enumerate() {
         progress(batch * BATCH);
         let indices: Vec<usize> = poses.iter().map(|(index, _)| *index).collect();
@@ -84,13 +87,26 @@ pub fn evaluate_views(
             let camera = ViewCamera { pinhole: recorded.pinhole, camera_from_world: world_from_camera.inverse() };
             views.push((*index, rasterizer.render(&on_gpu, &camera, [0.0; 3])?, recorded));
         }
-        let figures: Vec<ViewFigures> = views.par_iter().map(|(_, rendered, recorded)| compare(rendered, recorded)).collect();
-        for ((index, rendered, recorded), f) in views.into_iter().zip(figures) {
+        let exposed = |(index, mut rendered, recorded): (usize, Rendered, RectifiedImage)| {
+            let in_map_colors = compare(&rendered, &recorded);
+            let exposures = Some(selection.exposures).filter(|e| !e.is_empty() && (selection.is_held_out)(index));
+            let exposed = exposures.map(|exposures| {
+                rendered.expose(&exposures.at(sequence.entries[index].timestamp_s));
+                compare(&rendered, &recorded)
+            });
+            (index, rendered, recorded, in_map_colors, exposed)
+        };
+        let views: Vec<_> = views.into_par_iter().map(exposed).collect();
+        for (index, rendered, recorded, f, exposed) in views {
             all_frames.add(f.psnr, f.ssim, f.depth_l1);
             if index % MONOGS_EVERY == 0 && !selection.keyframes.contains(&index) {
                 monogs.add(f.psnr_lit, f.ssim, f.depth_l1);
             }
             if (selection.is_held_out)(index) {
+                if exposed.is_some() {
+                    map_colors.add(f.psnr, f.ssim, f.depth_l1);
+                }
+                let f = exposed.unwrap_or(f);
                 held_out.add(f.psnr, f.ssim, f.depth_l1);
                 let psnr_db = Some(f.psnr).filter(|psnr| psnr.is_finite());
                 let figures = ViewRecord { frame: index, psnr_db, ssim: f.ssim, depth_l1_m: f.depth_l1 };
@@ -98,7 +114,12 @@ pub fn evaluate_views(
             }
         }
     }
-    Ok(ImageProtocols { held_out: held_out.figures(), all_frames: all_frames.figures(), monogs: monogs.figures() })
+    Ok(ImageProtocols {
+        held_out: held_out.figures(),
+        held_out_map_colors: map_colors.figures(),
+        all_frames: all_frames.figures(),
+        monogs: monogs.figures(),
+    })
 }
 
 fn compare(rendered: &Rendered, recorded: &RectifiedImage) -> ViewFigures {

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{DensityConfig, LimitsConfig, PlaneSweepConfig, RefinePosesConfig};
+use super::{DensityConfig, ExposureConfig, LimitsConfig, PlaneSweepConfig, RefinePosesConfig};
 use crate::optimise::{AdamConfig, LossConfig, TileSkip};
 use crate::splat::ShDegree;
 
@@ -24,6 +24,7 @@ pub struct MappingConfig {
     pub skip: SkipConfig,
     pub limits: LimitsConfig,
     pub refine_poses: RefinePosesConfig,
+    pub exposure: ExposureConfig,
     pub seeding: SeedingConfig,
     pub plane_sweep: PlaneSweepConfig,
     pub points: PointsConfig,
@@ -45,6 +46,7 @@ impl Default for MappingConfig {
             skip: SkipConfig::default(),
             limits: LimitsConfig::default(),
             refine_poses: RefinePosesConfig::default(),
+            exposure: ExposureConfig::default(),
             seeding: SeedingConfig::default(),
             plane_sweep: PlaneSweepConfig::default(),
             points: PointsConfig::default(),
@@ -286,6 +288,7 @@ impl MappingConfig {
         if self.points.size_range < 1.0 {
             return Err(format!("mapping.points.size_range must be at least 1, not {}", self.points.size_range));
         }
+        self.exposure.validate().map_err(|e| format!("mapping.exposure: {e}"))?;
         self.plane_sweep.validate().map_err(|e| format!("mapping.plane_sweep: {e}"))?;
         self.refine_poses.validate().map_err(|e| format!("mapping.refine_poses: {e}"))?;
         self.density.validate().map_err(|e| format!("mapping.density: {e}"))?;

@@ -5,13 +5,14 @@ use std::borrow::Cow;
 use image::{GrayImage, Rgb, RgbImage};
 use serde::{Deserialize, Serialize};
 
+use super::exposure;
 use super::plane_sweep::{self, SourceView};
 use super::refine_poses::{RefinePosesConfig, Refinement, median_depth};
 use crate::geometry::{Pinhole, Se3};
 use crate::gpu::{Gpu, GpuError, plain};
 use crate::optimise::{TargetImage, TrainingView};
 use crate::sequence::{DepthImage, RectifiedImage};
-use crate::splat::ViewCamera;
+use crate::splat::{Exposure, ViewCamera};
 
 /// The tracker's number of a keyframe.
 pub type KeyframeId = usize;
@@ -25,6 +26,13 @@ pub struct Keyframe {
     pub depth_source: DepthSource,
     /// Earlier keyframes that see the same landmarks, strongest first.
     pub covisible: Vec<KeyframeId>,
+}
+
+impl Keyframe {
+    /// At the tracker's pose.
+    pub fn camera(&self) -> ViewCamera {
+        ViewCamera { pinhole: self.image.pinhole, camera_from_world: self.world_from_camera.inverse() }
+    }
 }
 
 /// Where a keyframe's depth comes from.
@@ -53,6 +61,8 @@ pub(super) struct MappedKeyframe {
     /// The tracker's camera_from_world, which the refinement goes out from.
     pub tracked_from_world: Se3,
     pub refinement: Refinement,
+    /// Of the recorded image against the map; the image that is kept is corrected.
+    pub exposure: Exposure,
     /// Median of the measured depths.
     pub depth_metres: f64,
     /// Until it is given back.
@@ -79,6 +89,7 @@ pub(super) struct KeyframeState {
     camera: ViewCamera,
     tracked_from_world: Se3,
     refinement: Refinement,
+    exposure: Exposure,
     depth_metres: f64,
     covisible: Vec<KeyframeId>,
     loss: f32,
@@ -127,14 +138,15 @@ impl Images {
 }
 
 impl MappedKeyframe {
-    /// Uploads the images, see [`Images::new`].
-    pub fn new(gpu: &Gpu, keyframe: &Keyframe, with_half: bool) -> Result<Self, GpuError> {
-        let (image, tracked_from_world) = (&keyframe.image, keyframe.world_from_camera.inverse());
+    /// Uploads the images, see [`Images::new`], whose colours are corrected already.
+    pub fn new(gpu: &Gpu, keyframe: &Keyframe, exposure: Exposure, with_half: bool) -> Result<Self, GpuError> {
+        let (image, camera) = (&keyframe.image, keyframe.camera());
         Ok(Self {
             id: keyframe.id,
-            camera: ViewCamera { pinhole: image.pinhole, camera_from_world: tracked_from_world },
-            tracked_from_world,
+            camera,
+            tracked_from_world: camera.camera_from_world,
             refinement: Refinement::default(),
+            exposure,
             depth_metres: median_depth(image),
             image: Some(Images::new(gpu, image, with_half)?),
             gray: matches!(keyframe.depth_source, DepthSource::Landmarks { .. }).then(|| plane_sweep::gray(&image.color)),
@@ -149,6 +161,7 @@ impl MappedKeyframe {
             camera: self.camera,
             tracked_from_world: self.tracked_from_world,
             refinement: self.refinement,
+            exposure: self.exposure,
             depth_metres: self.depth_metres,
             covisible: self.covisible.clone(),
             loss: self.loss,
@@ -173,6 +186,9 @@ impl MappedKeyframe {
             }
             image.to_mut().depth = Some(DepthImage { width, height, metres: metres.clone() });
         }
+        if state.exposure != Exposure::default() {
+            image.to_mut().color = exposure::corrected(&image.color, &state.exposure);
+        }
         let image = &*image;
         let images = state.tile_losses.as_ref().map(|_| Images::new(gpu, image, with_half)).transpose()?;
         if !images.iter().zip(&state.tile_losses).all(|(images, losses)| images.set_tile_losses(gpu, losses)) {
@@ -183,6 +199,7 @@ impl MappedKeyframe {
             camera: state.camera,
             tracked_from_world: state.tracked_from_world,
             refinement: state.refinement,
+            exposure: state.exposure,
             depth_metres: state.depth_metres,
             gray: state.swept.as_ref().map(|_| plane_sweep::gray(&image.color)),
             image: images,

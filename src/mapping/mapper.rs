@@ -3,12 +3,14 @@
 mod refine;
 mod state;
 
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use fastrand::Rng;
 use glam::{Quat, Vec3};
+use image::RgbImage;
 use serde::{Deserialize, Serialize};
 
 pub use refine::{RefineReport, Refinement};
@@ -20,14 +22,13 @@ use super::ledger::{self, Ledger};
 use super::plane_sweep::{self, SourceView};
 use super::refine_poses::{self, RefinedPair};
 use super::schedule::{self, Session, Step};
-use super::{DensityStrategy, Keyframe, KeyframeId, LimitsConfig, MappingConfig, limits, points, seeding};
+use super::{DensityStrategy, Keyframe, KeyframeId, LimitsConfig, MappingConfig, exposure, limits, points, seeding};
 use crate::geometry::Se3;
 use crate::gpu::{Gpu, GpuError};
 use crate::optimise::{GaussianScore, Optimiser, StepReport, TrainingView, WrongPixels};
 use crate::render::{GpuCloud, Rasterizer, Rendered};
 use crate::sequence::{KnownPoint, RectifiedImage};
-use crate::splat::GaussianCloud;
-use crate::splat::ViewCamera;
+use crate::splat::{Exposure, GaussianCloud, ViewCamera};
 
 const FIRST_CAPACITY: usize = 32_768;
 /// Steps submitted at once: the GPU never waits for the host between them, and a stop is heeded between batches.
@@ -59,6 +60,9 @@ pub struct KeyframeReport {
     pub iterations: usize,
     /// Mean PSNR of the steps' views before each step.
     pub psnr_db: f32,
+    /// Against the map's.
+    #[serde(default)]
+    pub exposure: Exposure,
 }
 
 /// Seeds, optimises and prunes the map.
@@ -96,20 +100,31 @@ impl Mapper {
         if keyframe.image.depth.is_none() && self.keyframes.is_empty() && self.cloud.is_empty() {
             return Err(MappingError::NoDepth { id: keyframe.id });
         }
-        let swept = self.sweep(keyframe);
-        let keyframe = swept.as_ref().unwrap_or(keyframe);
-        let mapped = MappedKeyframe::new(&self.gpu, keyframe, self.config.learns_at_half_size())?;
-        let seeded = self.seed(keyframe, &mapped.camera)?;
+        let mut keyframe = self.sweep(keyframe).map_or(Cow::Borrowed(keyframe), Cow::Owned);
+        let rendered = if self.cloud.is_empty() { None } else { Some(self.render(&keyframe.camera())?) };
+        let exposure = self.exposure(&keyframe.image.color, rendered.as_ref());
+        if exposure != Exposure::default() {
+            keyframe.to_mut().image.color = exposure::corrected(&keyframe.image.color, &exposure);
+        }
+        let seeded = self.seed(&keyframe, rendered.as_ref())?;
+        let mapped = MappedKeyframe::new(&self.gpu, &keyframe, exposure, self.config.learns_at_half_size())?;
         self.keyframes.push(mapped);
         self.limit_keyframes();
         let first = self.keyframes.len() == 1;
         let iterations = if first { self.config.first_iterations } else { self.config.iterations_per_keyframe };
         if iterations == 0 {
-            return Ok(KeyframeReport { id: keyframe.id, seeded, gaussians: self.cloud.len(), ..KeyframeReport::default() });
+            return Ok(KeyframeReport {
+                id: keyframe.id,
+                seeded,
+                gaussians: self.cloud.len(),
+                exposure,
+                ..KeyframeReport::default()
+            });
         }
         let (done, psnr_db) = self.optimise(iterations, stop)?;
         let (pruned, grown) = self.control_density()?;
-        Ok(KeyframeReport { id: keyframe.id, seeded, pruned, grown, gaussians: self.cloud.len(), iterations: done, psnr_db })
+        let (gaussians, iterations) = (self.cloud.len(), done);
+        Ok(KeyframeReport { id: keyframe.id, seeded, pruned, grown, gaussians, iterations, psnr_db, exposure })
     }
 
     /// Takes in points of the scene that are known before any keyframe, in the keyframes' world; `anchor` is the first of these.
@@ -169,7 +184,7 @@ impl Mapper {
         let DepthSource::Landmarks { right } = &keyframe.depth_source else { return None };
         let (image, config) = (&keyframe.image, &self.config.plane_sweep);
         let landmarks = image.depth.as_ref().filter(|_| config.enabled)?;
-        let camera = ViewCamera { pinhole: image.pinhole, camera_from_world: keyframe.world_from_camera.inverse() };
+        let camera = keyframe.camera();
         let beside = right.as_ref().map(|right| {
             let right_from_left = Se3::translation(-right.baseline_metres, 0.0, 0.0);
             let camera = ViewCamera { camera_from_world: right_from_left * camera.camera_from_world, ..camera };
@@ -190,12 +205,18 @@ impl Mapper {
         Some(Keyframe { image, ..keyframe.clone() })
     }
 
-    fn seed(&mut self, keyframe: &Keyframe, camera: &ViewCamera) -> Result<usize, MappingError> {
+    /// The exposure of an image of which the map shows `rendered`. A map that no step has moved yet shows nothing that counts.
+    fn exposure(&self, image: &RgbImage, rendered: Option<&Rendered>) -> Exposure {
+        let (config, last) = (&self.config.exposure, self.keyframes.last().map_or(Exposure::default(), |k| k.exposure));
+        let shown = rendered.filter(|_| config.enabled && !self.step_times.is_empty());
+        shown.map_or(last, |rendered| exposure::measure(image, rendered, &last, config))
+    }
+
+    fn seed(&mut self, keyframe: &Keyframe, rendered: Option<&Rendered>) -> Result<usize, MappingError> {
         if keyframe.image.depth.is_none() {
             return Ok(0);
         }
-        let rendered = if self.cloud.is_empty() { None } else { Some(self.render(camera)?) };
-        let mut seeds = seeding::seed(keyframe, rendered.as_ref(), &self.config.seeding, self.config.sh_degree);
+        let mut seeds = seeding::seed(keyframe, rendered, &self.config.seeding, self.config.sh_degree);
         if self.config.limits.limits_gaussians() {
             let most = self.most_gaussians();
             self.cloud.limit(most);

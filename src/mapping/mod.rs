@@ -3,6 +3,7 @@
 
 mod config;
 mod density;
+mod exposure;
 mod keyframe;
 mod ledger;
 mod limits;
@@ -16,6 +17,7 @@ mod seeding;
 
 pub use config::{MappingConfig, PointsConfig, RefineConfig, SeedingConfig, SkipConfig, WindowConfig};
 pub use density::{ClassicConfig, DensityConfig, DensityStrategy, VcdConfig};
+pub use exposure::ExposureConfig;
 pub use keyframe::{DepthSource, Keyframe, KeyframeId, RightImage};
 pub use limits::LimitsConfig;
 pub use mapper::{KeyframeReport, Mapper, MapperState, MappingError, RefineReport, Refinement};

@@ -11,7 +11,9 @@ use super::Outcome;
 use crate::config::Config;
 use crate::evaluation::metrics::{Adapter, AteFigures, MappingFigures, Metrics, RpeFigures, Times, UsualTimes};
 use crate::evaluation::views::{ComparedView, ViewSelection, evaluate_views};
-use crate::evaluation::{Alignment, Comparison, draw_trajectory, evaluate_trajectory, machine, sha256_hex, write_json};
+use crate::evaluation::{
+    Alignment, Comparison, Exposures, draw_trajectory, evaluate_trajectory, machine, sha256_hex, write_json,
+};
 use crate::export::{ExportError, MapFormat, remove_partials, write_atomically};
 use crate::geometry::{Se3, Trajectory};
 use crate::gpu::{Gpu, GpuError};
@@ -28,6 +30,8 @@ pub const VIEWS: &str = "views";
 pub const DRAWING: &str = "trajectory.svg";
 pub const HISTORY: &str = "history.json";
 pub const COMPARISON: &str = "comparison.json";
+/// Of the keyframes, if exposures are corrected.
+pub const EXPOSURES: &str = "exposures.json";
 /// Until the run is finished, and if it keeps any.
 pub const CHECKPOINT: &str = "checkpoint.bin";
 
@@ -97,6 +101,10 @@ pub fn write_results(out: &Path, outcome: &Outcome, config: &Config) -> Result<W
     write_atomically(&out.join(KEYFRAMES), outcome.keyframe_trajectory().to_tum().as_bytes())?;
     write_atomically(&out.join(CONFIG), config.to_toml().as_bytes())?;
     write_records(&out.join(HISTORY), &outcome.history)?;
+    remove_file(&out.join(EXPOSURES))?;
+    if config.mapping.exposure.enabled {
+        write_records(&out.join(EXPOSURES), &outcome.exposures())?;
+    }
     let bytes = MapFormat::Ply.write(&outcome.cloud, &out.join(MAP))?;
     Ok(WrittenMap { bytes: bytes.len() as u64, hash: sha256_hex(&bytes) })
 }
@@ -116,6 +124,7 @@ pub struct Subject<'a> {
     pub keyframes: Trajectory,
     pub keyframe_indices: BTreeSet<usize>,
     pub cloud: &'a GaussianCloud,
+    pub exposures: Exposures,
 }
 
 /// Measures trajectory and images, and writes the held-out views beside their renders. `progress` hears how many views are done.
@@ -150,7 +159,12 @@ pub fn measure(
         seen += 1;
         comparison.views.push(view.figures);
     };
-    let selection = ViewSelection { poses: &subject.poses, keyframes: &subject.keyframe_indices, is_held_out: &is_held_out };
+    let selection = ViewSelection {
+        poses: &subject.poses,
+        keyframes: &subject.keyframe_indices,
+        is_held_out: &is_held_out,
+        exposures: &subject.exposures,
+    };
     let images = evaluate_views((sequence, config.map_scale), (gpu, subject.cloud), &selection, &mut on_held_out, progress)?;
     if let Some(error) = picture_error {
         return Err(error);

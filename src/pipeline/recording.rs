@@ -9,13 +9,16 @@ use crossbeam::channel::{bounded, unbounded};
 
 use super::map_thread::{self, MapSummary, Round};
 use super::measurements::{Listener, Teller};
+use super::run::exposures;
 use super::{MapperMessage, PipelineError, Progress, known_poses, read_thread, track_thread};
 use crate::config::Config;
+use crate::evaluation::Exposures;
 use crate::geometry::Se3;
 use crate::gpu::Gpu;
 use crate::mapping::MappingConfig;
 use crate::sequence::Sequence;
 use crate::splat::GaussianCloud;
+use crate::tracking::KeyframePose;
 
 const FRAMES_AHEAD: usize = 4;
 
@@ -26,6 +29,7 @@ pub struct Recording {
     pub messages: Vec<MapperMessage>,
     /// `(frame index, world_from_camera)` of every tracked frame.
     pub poses: Vec<(usize, Se3)>,
+    keyframes: Vec<KeyframePose>,
     /// Units of its world to a metre as the mapper's lengths mean it.
     units_per_metre: f64,
 }
@@ -34,6 +38,7 @@ pub struct Recording {
 #[derive(Debug)]
 pub struct Mapped {
     pub cloud: Arc<GaussianCloud>,
+    pub exposures: Exposures,
     /// Time of the mapper alone.
     pub wall_s: f64,
     pub steps: usize,
@@ -64,7 +69,7 @@ pub fn record(sequence: &Sequence, config: &Config, progress: &Progress) -> Resu
         return Err(error);
     }
     let poses = track.trajectory.iter().map(|(index, pose)| (*index, pose.world_from_camera)).collect();
-    Ok(Recording { messages: messages.into_iter().collect(), poses, units_per_metre })
+    Ok(Recording { messages: messages.into_iter().collect(), poses, keyframes: track.keyframes, units_per_metre })
 }
 
 impl Recording {
@@ -88,13 +93,14 @@ impl Recording {
         let mut on_round = |round: Round<'_>| {
             let reached = Instant::now();
             let wall_s = (started.elapsed() - paused).as_secs_f64();
-            on_round(Mapped { cloud: round.cloud.clone(), wall_s, steps: round.steps });
+            on_round(Mapped { cloud: round.cloud.clone(), exposures: Exposures::default(), wall_s, steps: round.steps });
             paused += reached.elapsed();
         };
         let config = config.in_units(self.units_per_metre as f32);
         let summary = map_thread::map(gpu, &config, &messages, &Teller::default(), (progress, &mut on_round), None);
-        let MapSummary { cloud, step_ms, error, .. } = summary;
-        let mapped = Mapped { cloud, wall_s: (started.elapsed() - paused).as_secs_f64(), steps: step_ms.len() };
+        let MapSummary { cloud, keyframes, step_ms, error, .. } = summary;
+        let exposures = exposures(&self.keyframes, &keyframes);
+        let mapped = Mapped { cloud, exposures, wall_s: (started.elapsed() - paused).as_secs_f64(), steps: step_ms.len() };
         error.map_or(Ok(mapped), Err)
     }
 }

@@ -1,5 +1,6 @@
 //! Starts the threads, waits for them, and gathers what they made.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::thread::{Builder, ScopedJoinHandle};
 use std::time::Instant;
@@ -12,9 +13,10 @@ use super::measurements;
 use super::messages::guarded;
 use super::read_thread::{self, ReadSummary};
 use super::track_thread::{self, TrackSummary};
-use super::{Checkpoints, History, PipelineError, Progress};
+use super::{Checkpoints, History, KeyframeRecord, PipelineError, Progress};
 use crate::config::Config;
 use crate::evaluation::image::WINDOW as SSIM_WINDOW;
+use crate::evaluation::{ExposureRecord, Exposures};
 use crate::geometry::{StampedPose, Trajectory};
 use crate::gpu::Gpu;
 use crate::sequence::{Sensor, Sequence};
@@ -49,6 +51,20 @@ impl Outcome {
     pub fn keyframe_trajectory(&self) -> Trajectory {
         Trajectory { poses: self.keyframes.iter().map(KeyframePose::stamped).collect() }
     }
+
+    /// What the mapper found of the keyframes' exposures.
+    pub fn exposures(&self) -> Exposures {
+        exposures(&self.keyframes, &self.history.keyframes)
+    }
+}
+
+/// Exposures of mapped keyframes, at their times.
+pub(super) fn exposures(tracked: &[KeyframePose], mapped: &[KeyframeRecord]) -> Exposures {
+    let times: BTreeMap<usize, f64> = tracked.iter().map(|k| (k.id, k.timestamp_s)).collect();
+    let record = |KeyframeRecord { report, .. }: &KeyframeRecord| {
+        Some(ExposureRecord { timestamp_s: *times.get(&report.id)?, log_gain: report.exposure })
+    };
+    Exposures::new(mapped.iter().filter_map(record).collect())
 }
 
 /// Says before any work whether a map could be started from this sequence.

@@ -13,7 +13,7 @@ use super::shaders;
 use super::sort::{Scan, ScanJob, Sort};
 use super::workspace::{Room, Workspace};
 use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, workgroups};
-use crate::splat::ViewCamera;
+use crate::splat::{Exposure, ViewCamera};
 
 /// Depth keys are whole f32.
 const DEPTH_KEY_BITS: u32 = 32;
@@ -33,6 +33,12 @@ impl Rendered {
     /// Share of the pixel `i` that the map covers.
     pub fn alpha(&self, i: usize) -> f32 {
         1.0 - self.transmittance[i]
+    }
+
+    /// Becomes what a camera of this exposure records of it.
+    pub fn expose(&mut self, exposure: &Exposure) {
+        let [r, g, b] = exposure.gains().to_array();
+        self.color_depth.iter_mut().for_each(|p| *p = [p[0] * r, p[1] * g, p[2] * b, p[3]]);
     }
 
     /// Expected depth of what was blended at pixel `i`, metres; 0 where nothing was.

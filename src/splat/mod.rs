@@ -1,5 +1,6 @@
 //! The map: Gaussians as a structure of arrays, spherical harmonics, and immutable snapshots for everyone but the mapper.
 
+mod exposure;
 pub mod model;
 pub mod sh;
 
@@ -7,6 +8,7 @@ use std::sync::Arc;
 
 use glam::{Quat, Vec3};
 
+pub use exposure::Exposure;
 pub use model::ViewCamera;
 pub use sh::ShDegree;
 

@@ -10,7 +10,6 @@ use keysplat::evaluation::views::{ViewSelection, evaluate_views};
 use keysplat::gpu::Gpu;
 use keysplat::pipeline::{self, Mapped, Progress, Recording};
 use keysplat::sequence::Sequence;
-use keysplat::splat::GaussianCloud;
 use miette::IntoDiagnostic;
 use serde::Serialize;
 
@@ -81,7 +80,7 @@ pub(super) fn ablation(args: &AblationArgs) -> miette::Result<()> {
             let mut config = config.clone();
             config.mapping.iterations_per_keyframe = iterations;
             let mut row = |mapped: &Mapped| -> miette::Result<()> {
-                let held_out = held_out((&sequence, &config), &gpu, &recording, &mapped.cloud);
+                let held_out = held_out((&sequence, &config), &gpu, &recording, mapped);
                 rows.push(Row::new(variant, iterations, mapped, held_out?));
                 print(rows.last().expect("one was pushed"));
                 Ok(())
@@ -112,11 +111,11 @@ fn held_out(
     (sequence, config): (&Sequence, &Config),
     gpu: &Arc<Gpu>,
     recording: &Recording,
-    cloud: &GaussianCloud,
+    Mapped { cloud, exposures, .. }: &Mapped,
 ) -> miette::Result<Option<ImageFigures>> {
     let is_held_out = |index: usize| config.replay.is_held_out(index);
     let poses: Vec<_> = recording.poses.iter().filter(|(index, _)| is_held_out(*index)).copied().collect();
-    let selection = ViewSelection { poses: &poses, keyframes: &BTreeSet::new(), is_held_out: &is_held_out };
+    let selection = ViewSelection { poses: &poses, keyframes: &BTreeSet::new(), is_held_out: &is_held_out, exposures };
     let images =
         evaluate_views((sequence, config.map_scale), (gpu, cloud), &selection, &mut |_| (), &|_| ()).into_diagnostic()?;
     Ok(images.held_out)

@@ -1,0 +1,127 @@
+//! A keyframe's exposure against the map's, which is that of the first keyframe, and the image as it would be in the map's.
+//!
+//! It is measured once, when the keyframe comes, on the render that seeding asks for anyway: the median ratio of image and render over the
+//! pixels that both show well, in each channel. The map then learns from corrected images, and loss, seeds and scores know nothing of it.
+
+use image::{Rgb, RgbImage};
+use serde::{Deserialize, Serialize};
+
+use crate::render::Rendered;
+use crate::splat::Exposure;
+
+/// Whether, and how firmly, exposures are corrected.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ExposureConfig {
+    /// Measure each keyframe's exposure and white balance, and let the map learn from images without them.
+    pub enabled: bool,
+    /// Weight of the last keyframe's exposure against what is measured, as a share of the image's pixels.
+    pub prior_share: f32,
+    /// Largest change of a channel's log gain from one keyframe to the next; more is taken for something else.
+    pub max_change: f32,
+}
+
+impl Default for ExposureConfig {
+    fn default() -> Self {
+        Self { enabled: true, prior_share: 0.1, max_change: 0.7 }
+    }
+}
+
+impl ExposureConfig {
+    /// Says what is wrong with the values, if anything.
+    pub fn validate(&self) -> Result<(), String> {
+        let positive = |v: f32| v.is_finite() && v > 0.0;
+        if positive(self.prior_share) && positive(self.max_change) {
+            Ok(())
+        } else {
+            Err("prior_share and max_change must be positive".into())
+        }
+    }
+}
+
+/// Pixels that the map covers less than this say nothing.
+const MIN_ALPHA: f32 = 0.95;
+/// Nor do those that are nearly black or nearly saturated in the image or the render.
+const WELL_EXPOSED: std::ops::Range<f32> = 0.08..0.92;
+
+/// The exposure of an image of which the map shows `rendered`; `last` is that of the keyframe before.
+pub(super) fn measure(image: &RgbImage, rendered: &Rendered, last: &Exposure, config: &ExposureConfig) -> Exposure {
+    let covered: Vec<usize> = (0..rendered.color_depth.len()).filter(|&i| rendered.alpha(i) >= MIN_ALPHA).collect();
+    let channel = |k: usize| {
+        let log_ratio = |&i: &usize| {
+            let recorded = f32::from(image.as_raw()[3 * i + k]) / 255.0;
+            let shown = rendered.color_depth[i][k];
+            (WELL_EXPOSED.contains(&recorded) && WELL_EXPOSED.contains(&shown)).then(|| (recorded / shown).ln())
+        };
+        let mut ratios: Vec<f32> = covered.iter().filter_map(log_ratio).collect();
+        let count = ratios.len();
+        if count == 0 {
+            return last.0[k];
+        }
+        let (_, median, _) = ratios.select_nth_unstable_by(count / 2, f32::total_cmp);
+        let trust = count as f32 / (count as f32 + config.prior_share * rendered.color_depth.len() as f32);
+        let change = *median - last.0[k];
+        if change.abs() <= config.max_change { last.0[k] + trust * change } else { last.0[k] }
+    };
+    Exposure([channel(0), channel(1), channel(2)])
+}
+
+/// The image as the map's exposure would have it.
+pub(super) fn corrected(image: &RgbImage, exposure: &Exposure) -> RgbImage {
+    let gains = exposure.gains();
+    let table = |k: usize| -> [u8; 256] { std::array::from_fn(|value| (value as f32 / gains[k]).round().min(255.0) as u8) };
+    let tables = [table(0), table(1), table(2)];
+    let mut corrected = image.clone();
+    corrected.pixels_mut().for_each(|Rgb(pixel)| *pixel = std::array::from_fn(|k| tables[k][usize::from(pixel[k])]));
+    corrected
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A picture of some colours, and a render of it by a map of another exposure, half of which is missing.
+    fn pair(gains: [f32; 3]) -> (RgbImage, Rendered) {
+        let shown = |x: u32, y: u32, k: usize| 0.2 + 0.5 * (((x * 7 + y * 13 + k as u32 * 5) % 32) as f32 / 32.0);
+        let image =
+            RgbImage::from_fn(32, 24, |x, y| Rgb(std::array::from_fn(|k| (shown(x, y, k) * gains[k] * 255.0).round() as u8)));
+        let pixels = || (0..32 * 24u32).map(|i| (i % 32, i / 32));
+        let rendered = Rendered {
+            width: 32,
+            height: 24,
+            color_depth: pixels().map(|(x, y)| [shown(x, y, 0), shown(x, y, 1), shown(x, y, 2), 1.0]).collect(),
+            transmittance: pixels().map(|(x, _)| if x < 16 { 0.0 } else { 0.9 }).collect(),
+        };
+        (image, rendered)
+    }
+
+    #[test]
+    fn the_gains_are_found_and_taken_out() {
+        let gains = [1.2, 1.0, 0.85];
+        let (image, rendered) = pair(gains);
+        let config = ExposureConfig { prior_share: 1e-6, ..ExposureConfig::default() };
+        let exposure = measure(&image, &rendered, &Exposure::default(), &config);
+        assert!((exposure.gains() - glam::Vec3::from(gains)).abs().max_element() < 0.01, "{exposure:?}");
+        let corrected = corrected(&image, &exposure);
+        let off = |(i, p): (usize, &Rgb<u8>)| {
+            (0..3).map(|k| (f32::from(p.0[k]) - 255.0 * rendered.color_depth[i][k]).abs()).fold(0.0, f32::max)
+        };
+        assert!(corrected.pixels().enumerate().map(off).fold(0.0, f32::max) < 2.5);
+    }
+
+    #[test]
+    fn what_little_is_seen_moves_it_little_and_a_leap_not_at_all() {
+        let (image, mut rendered) = pair([1.2; 3]);
+        let config = ExposureConfig::default();
+        let last = Exposure([0.1; 3]);
+        let whole = measure(&image, &rendered, &last, &config);
+        let only = |i: usize| i.is_multiple_of(32);
+        (0..rendered.transmittance.len()).filter(|&i| !only(i)).for_each(|i| rendered.transmittance[i] = 1.0);
+        let little = measure(&image, &rendered, &last, &config);
+        assert!((0..3).all(|k| last.0[k] < little.0[k] && little.0[k] < whole.0[k]), "{little:?} {whole:?}");
+        rendered.transmittance.fill(1.0);
+        assert_eq!(measure(&image, &rendered, &last, &config), last);
+        let (dark, rendered) = pair([0.45; 3]);
+        assert_eq!(measure(&dark, &rendered, &last, &config), last);
+    }
+}
