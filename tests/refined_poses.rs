@@ -98,7 +98,7 @@ fn a_disturbed_keyframe_returns_to_the_truth() {
         assert!(pair.sigma_rotation_rad > 0.0 && pair.sigma_translation_metres > pair.sigma_rotation_rad);
         let after = error(pair.keyframe, pair.relative_to, &pair.keyframe_from_relative);
         eprintln!("{} from {}: {after:?}, disturbed {before:?}", pair.keyframe, pair.relative_to);
-        assert!(after.0 < 0.4 * before.0 && after.1 < 0.4 * before.1);
+        assert!(after.0 < 0.5 * before.0 && after.1 < 0.5 * before.1);
     }
     assert!(pairs.iter().any(|p| p.keyframe == DISTURBED));
     assert_eq!(refined(&gpu, on), (pairs, map));

@@ -4,9 +4,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::render::layout::AdamSetup;
 
-/// Step sizes and decay rates (Kingma & Ba 2015). The ratios between parameters follow 3DGS (Kerbl et al. 2023) at four times its
-/// rates: a live map gets tens of steps a keyframe, not tens of thousands. On a recorded kitchen and a synthetic room that is worth
-/// 1.4–1.9 dB at equal time; eight times gains nothing more.
+/// Step sizes and decay rates (Kingma & Ba 2015). The ratios between parameters began as those of 3DGS (Kerbl et al. 2023) at four times its
+/// rates: a live map gets tens of steps a keyframe, not tens of thousands. Sizes and turns take three times that still, and the first
+/// moment forgets sooner, since each step sees another view. `benches/README.md` has what these are worth.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct AdamConfig {
@@ -38,12 +38,12 @@ impl Default for AdamConfig {
         Self {
             position_rate: 0.08,
             opacity_rate: 1e-1,
-            scale_rate: 2e-2,
-            rotation_rate: 4e-3,
+            scale_rate: 6e-2,
+            rotation_rate: 1.2e-2,
             color_rate: 2e-2,
             harmonics_rate: 1e-2,
             harmonics_every: 1,
-            beta_1: 0.9,
+            beta_1: 0.8,
             beta_2: 0.999,
             epsilon: 1e-15,
             max_elongation: 8.0,
