@@ -98,22 +98,27 @@ fn assert_same_run(a: &Path, b: &Path) {
     assert_eq!(names(a), names(b));
 }
 
-/// Killed between two checkpoints, again while it catches up, and again later, the run ends as it would have.
-fn survives(name: &str, more: &[&str], checkpoints: usize) {
-    let whole = unbroken(&format!("{name}-whole"), recording(), more);
+/// Killed between two checkpoints, again while it catches up, and again later, the run ends as it would have, and says that it was
+/// interrupted.
+fn survives(name: &str, recording: &Path, more: &[&str], checkpoints: usize) {
+    let whole = unbroken(&format!("{name}-whole"), recording, more);
     let out = scratch().join(name);
-    killed(keeping(recording(), &out, more), &out, (checkpoints, 20));
+    killed(keeping(recording, &out, more), &out, (checkpoints, 20));
     killed(resume(&out), &out, (0, 400));
     killed(resume(&out), &out, (2, 0));
     let said = finish(resume(&out)).succeeded();
     assert!(said.stderr.contains("caught up with the checkpoint"), "{}", said.stderr);
     assert_same_run(&out, &whole);
+    // The second part may not have come to a checkpoint.
+    let resumed = metrics(&out).resumed;
+    assert!((2..=3).contains(&resumed) && metrics(&whole).resumed == 0, "resumed {resumed} times");
+    assert!(said.stdout.contains(&format!("resumed {resumed}×")), "{}", said.stdout);
 }
 
 #[test]
 fn a_killed_run_ends_as_the_unbroken_one() {
     if !skipped_without_adapter() {
-        survives("killed", &[], 3);
+        survives("killed", recording(), &[], 3);
     }
 }
 
@@ -125,7 +130,7 @@ fn what_the_tracker_was_told_and_what_memory_allows_comes_again() {
     }
     let settings = ["tracking.keyframe_translation=0.005", "mapping.refine_poses.enabled=true", "mapping.limits.max_keyframes=8"];
     let more: Vec<&str> = settings.iter().flat_map(|s| ["--set", s]).chain(["--max-gpu-memory", "20M"]).collect();
-    survives("told", &more, 11);
+    survives("told", recording(), &more, 11);
     let whole = metrics(&scratch().join("told-whole"));
     assert!(whole.keyframes > Some(12) && whole.gaussians < Some(4000), "neither limit matters: {whole}");
 }
@@ -143,6 +148,10 @@ fn a_refinement_goes_on_where_it_stood() {
     killed(keeping(recording(), &out, &refine), &out, (keyframes + 2, 0));
     finish(resume(&out)).succeeded();
     assert_same_run(&out, &whole);
+    assert_eq!(metrics(&out).resumed, 1);
+    // The report says it too.
+    finish(keysplat(["report".as_ref(), out.as_os_str()])).succeeded();
+    assert!(std::fs::read_to_string(out.join("report.html")).unwrap().contains("unpaced, resumed 1×"));
 }
 
 #[cfg(unix)]

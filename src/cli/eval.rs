@@ -139,6 +139,7 @@ fn foreign_metrics(sequence: &Sequence, config: &Config) -> Metrics {
         gaussians: None,
         map_bytes: None,
         map_hash: None,
+        resumed: 0,
         wall_s: None,
         tracking_ms: None,
         mapping: None,

@@ -223,6 +223,7 @@ pub fn write_metrics(
         tracking_ms: Times::of(&outcome.tracking_ms),
         mapping: Some(MappingFigures {
             iterations,
+        resumed: outcome.resumed,
             iterations_per_frame: iterations as f64 / frames.max(1) as f64,
             ms_per_iteration: UsualTimes::of(&outcome.step_ms),
             map_width: pinhole.width,
