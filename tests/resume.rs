@@ -238,6 +238,24 @@ fn another_recording_is_refused() {
 }
 
 #[test]
+fn a_folder_takes_one_run_at_a_time() {
+    if skipped_without_adapter() {
+        return;
+    }
+    let out = scratch().join("twice");
+    let mut first = started(keeping(recording(), &out, &["--set", "mapping.iterations_per_keyframe=200"]), &out, 2);
+    let busy = ["another keysplat is at work in", out.to_str().unwrap(), "choose another folder"];
+    finish(run_command(recording(), &out, &[])).refused(&busy);
+    finish(resume(&out)).refused(&busy);
+    assert!(first.try_wait().unwrap().is_none(), "it ended too early to be in the way");
+    first.kill().unwrap();
+    first.wait().unwrap();
+    // What is left of it is in nobody's way.
+    assert!(out.join(".lock").exists());
+    finish(run_command(recording(), &out, &[])).succeeded();
+}
+
+#[test]
 fn what_is_finished_or_was_never_begun_says_so() {
     if skipped_without_adapter() {
         return;

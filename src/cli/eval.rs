@@ -60,7 +60,7 @@ pub fn eval(args: &EvalArgs, verbosity: Verbosity) -> miette::Result<()> {
         );
     }
     let gpu = Gpu::open(config.adapter.as_deref()).into_diagnostic()?;
-    outputs::prepare_folder(&args.dir).into_diagnostic()?;
+    let _lock = outputs::prepare_folder(&args.dir).into_diagnostic()?;
     let subject = Subject {
         trajectory: &trajectory,
         keyframe_indices: frames_of(&sequence, &keyframes).into_iter().map(|(index, _)| index).collect::<BTreeSet<usize>>(),

@@ -204,7 +204,7 @@ pub fn replay(
         pipeline::check_first_depth(&sequence).into_diagnostic()?;
     }
     let gpu = Gpu::open(config.adapter.as_deref()).into_diagnostic()?;
-    outputs::prepare_folder(&out).into_diagnostic()?;
+    let _lock = outputs::prepare_folder(&out).into_diagnostic()?;
     let checkpoints = checkpoints(from, (&sequence, config), &gpu, &out)?;
     tracing::info!(
         sequence = sequence.name,
