@@ -7,10 +7,12 @@ use std::process::{Child, Command, Stdio};
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
+use common::pairs::stereo_recording;
 use common::recording::{
     Finished, change_line, color_file, copy_folder, copy_of_recording, finish, keysplat, metrics, recording, run_command,
     scratch, skipped_without_adapter, truncate,
 };
+use keysplat::sequence::SensorKind;
 
 /// A keyframe for nearly each frame, so that there are many moments between two.
 const KEYFRAMES: [&str; 4] = ["--set", "tracking.keyframe_translation=0.02", "--set", "mapping.iterations_per_keyframe=10"];
@@ -120,6 +122,18 @@ fn a_killed_run_ends_as_the_unbroken_one() {
     if !skipped_without_adapter() {
         survives("killed", recording(), &[], 3);
     }
+}
+
+/// Depth then comes from the right eye: for the tracker's landmarks, and swept for between them.
+#[test]
+fn a_killed_stereo_run_ends_as_the_unbroken_one() {
+    if skipped_without_adapter() {
+        return;
+    }
+    survives("stereo", stereo_recording(), &[], 3);
+    let whole = metrics(&scratch().join("stereo-whole"));
+    assert!(whole.sensor == SensorKind::Stereo && whole.frames_tracked == whole.frames, "{whole}");
+    assert!(whole.ate_rmse_m.all_frames.unwrap() < 0.02, "{whole}");
 }
 
 /// The mapper then talks back to the tracker, counts every byte that it uses, and has given images back.
