@@ -252,6 +252,28 @@ fn another_recording_is_refused() {
 }
 
 #[test]
+fn a_recording_that_moved_is_named_anew() {
+    if skipped_without_adapter() {
+        return;
+    }
+    let (there, elsewhere) = (copy_of_recording("there"), scratch().join("elsewhere"));
+    let out = scratch().join("moved");
+    killed(keeping(&there, &out, &[]), &out, (3, 0));
+    std::fs::rename(&there, &elsewhere).unwrap();
+    finish(resume(&out)).refused(&["no longer at", there.to_str().unwrap(), "--sequence"]);
+    let resume_with = |recording: &Path| {
+        let mut command = resume(&out);
+        command.current_dir(scratch()).arg("--sequence").arg(recording);
+        command
+    };
+    finish(resume_with(stereo_recording())).refused(&["checkpoint.bin is of another run", "camera or times"]);
+    // It stays where it was named, for the part after this one too.
+    killed(resume_with(Path::new("elsewhere")), &out, (2, 0));
+    finish(resume(&out)).succeeded();
+    assert_same_run(&out, &unbroken("moved-whole", recording(), &[]));
+}
+
+#[test]
 fn a_folder_takes_one_run_at_a_time() {
     if skipped_without_adapter() {
         return;

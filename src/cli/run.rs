@@ -133,7 +133,7 @@ impl RunArgs {
         if let Some(path) = &self.sequence {
             // Absolute, so that the written configuration finds it from anywhere.
             let path = std::path::absolute(path).into_diagnostic()?;
-            config.sequence = Some(SequenceConfig { path, layout: None, sensor: None, camera: None });
+            config.sequence = Some(SequenceConfig { path, ..SequenceConfig::default() });
         }
         let sequence = config
             .sequence
