@@ -77,7 +77,7 @@ fn absolute(path: &str) -> miette::Result<String> {
 
 /// See [`Budget`].
 #[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
-enum BudgetName {
+pub enum BudgetName {
     /// Keep up with the recording's own pace: resolution and steps follow from what the adapter can do.
     Realtime,
     /// The defaults.
