@@ -29,7 +29,7 @@ pub struct Config {
 }
 
 /// Where a recording lies and how to read it.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SequenceConfig {
     /// A folder, or a video.

@@ -32,7 +32,7 @@ fn gpu_error(outcome: &Outcome) -> &GpuError {
 fn assert_written(name: &str, outcome: &Outcome) {
     assert!(!outcome.cloud.is_empty(), "the map of the keyframes before the failure is kept");
     let out = scratch().join(name);
-    outputs::prepare_folder(&out).unwrap();
+    let _lock = outputs::prepare_folder(&out).unwrap();
     outputs::write_results(&out, outcome, &config()).unwrap();
     assert_eq!(MapFormat::Ply.read(&out.join(outputs::MAP)).unwrap().len(), outcome.cloud.len());
 }

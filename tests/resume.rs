@@ -7,10 +7,12 @@ use std::process::{Child, Command, Stdio};
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
+use common::pairs::stereo_recording;
 use common::recording::{
     Finished, change_line, color_file, copy_folder, copy_of_recording, finish, keysplat, metrics, recording, run_command,
     scratch, skipped_without_adapter, truncate,
 };
+use keysplat::sequence::SensorKind;
 
 /// A keyframe for nearly each frame, so that there are many moments between two.
 const KEYFRAMES: [&str; 4] = ["--set", "tracking.keyframe_translation=0.02", "--set", "mapping.iterations_per_keyframe=10"];
@@ -98,23 +100,40 @@ fn assert_same_run(a: &Path, b: &Path) {
     assert_eq!(names(a), names(b));
 }
 
-/// Killed between two checkpoints, again while it catches up, and again later, the run ends as it would have.
-fn survives(name: &str, more: &[&str], checkpoints: usize) {
-    let whole = unbroken(&format!("{name}-whole"), recording(), more);
+/// Killed between two checkpoints, again while it catches up, and again later, the run ends as it would have, and says that it was
+/// interrupted.
+fn survives(name: &str, recording: &Path, more: &[&str], checkpoints: usize) {
+    let whole = unbroken(&format!("{name}-whole"), recording, more);
     let out = scratch().join(name);
-    killed(keeping(recording(), &out, more), &out, (checkpoints, 20));
+    killed(keeping(recording, &out, more), &out, (checkpoints, 20));
     killed(resume(&out), &out, (0, 400));
     killed(resume(&out), &out, (2, 0));
     let said = finish(resume(&out)).succeeded();
     assert!(said.stderr.contains("caught up with the checkpoint"), "{}", said.stderr);
     assert_same_run(&out, &whole);
+    // The second part may not have come to a checkpoint.
+    let resumed = metrics(&out).resumed;
+    assert!((2..=3).contains(&resumed) && metrics(&whole).resumed == 0, "resumed {resumed} times");
+    assert!(said.stdout.contains(&format!("resumed {resumed}×")), "{}", said.stdout);
 }
 
 #[test]
 fn a_killed_run_ends_as_the_unbroken_one() {
     if !skipped_without_adapter() {
-        survives("killed", &[], 3);
+        survives("killed", recording(), &[], 3);
     }
+}
+
+/// Depth then comes from the right eye: for the tracker's landmarks, and swept for between them.
+#[test]
+fn a_killed_stereo_run_ends_as_the_unbroken_one() {
+    if skipped_without_adapter() {
+        return;
+    }
+    survives("stereo", stereo_recording(), &[], 3);
+    let whole = metrics(&scratch().join("stereo-whole"));
+    assert!(whole.sensor == SensorKind::Stereo && whole.frames_tracked == whole.frames, "{whole}");
+    assert!(whole.ate_rmse_m.all_frames.unwrap() < 0.02, "{whole}");
 }
 
 /// The mapper then talks back to the tracker, counts every byte that it uses, and has given images back.
@@ -125,7 +144,7 @@ fn what_the_tracker_was_told_and_what_memory_allows_comes_again() {
     }
     let settings = ["tracking.keyframe_translation=0.005", "mapping.refine_poses.enabled=true", "mapping.limits.max_keyframes=8"];
     let more: Vec<&str> = settings.iter().flat_map(|s| ["--set", s]).chain(["--max-gpu-memory", "20M"]).collect();
-    survives("told", &more, 11);
+    survives("told", recording(), &more, 11);
     let whole = metrics(&scratch().join("told-whole"));
     assert!(whole.keyframes > Some(12) && whole.gaussians < Some(4000), "neither limit matters: {whole}");
 }
@@ -143,6 +162,10 @@ fn a_refinement_goes_on_where_it_stood() {
     killed(keeping(recording(), &out, &refine), &out, (keyframes + 2, 0));
     finish(resume(&out)).succeeded();
     assert_same_run(&out, &whole);
+    assert_eq!(metrics(&out).resumed, 1);
+    // The report says it too.
+    finish(keysplat(["report".as_ref(), out.as_os_str()])).succeeded();
+    assert!(std::fs::read_to_string(out.join("report.html")).unwrap().contains("unpaced, resumed 1×"));
 }
 
 #[cfg(unix)]
@@ -226,6 +249,46 @@ fn another_recording_is_refused() {
     picture.get_pixel_mut(0, 0).0[0] ^= 1;
     picture.save(&image).unwrap();
     resumed_after("a-bit", |_| ()).refused(&["checkpoint.bin cannot be resumed", "put the recording back"]);
+}
+
+#[test]
+fn a_recording_that_moved_is_named_anew() {
+    if skipped_without_adapter() {
+        return;
+    }
+    let (there, elsewhere) = (copy_of_recording("there"), scratch().join("elsewhere"));
+    let out = scratch().join("moved");
+    killed(keeping(&there, &out, &[]), &out, (3, 0));
+    std::fs::rename(&there, &elsewhere).unwrap();
+    finish(resume(&out)).refused(&["no longer at", there.to_str().unwrap(), "--sequence"]);
+    let resume_with = |recording: &Path| {
+        let mut command = resume(&out);
+        command.current_dir(scratch()).arg("--sequence").arg(recording);
+        command
+    };
+    finish(resume_with(stereo_recording())).refused(&["checkpoint.bin is of another run", "camera or times"]);
+    // It stays where it was named, for the part after this one too.
+    killed(resume_with(Path::new("elsewhere")), &out, (2, 0));
+    finish(resume(&out)).succeeded();
+    assert_same_run(&out, &unbroken("moved-whole", recording(), &[]));
+}
+
+#[test]
+fn a_folder_takes_one_run_at_a_time() {
+    if skipped_without_adapter() {
+        return;
+    }
+    let out = scratch().join("twice");
+    let mut first = started(keeping(recording(), &out, &["--set", "mapping.iterations_per_keyframe=200"]), &out, 2);
+    let busy = ["another keysplat is at work in", out.to_str().unwrap(), "choose another folder"];
+    finish(run_command(recording(), &out, &[])).refused(&busy);
+    finish(resume(&out)).refused(&busy);
+    assert!(first.try_wait().unwrap().is_none(), "it ended too early to be in the way");
+    first.kill().unwrap();
+    first.wait().unwrap();
+    // What is left of it is in nobody's way.
+    assert!(out.join(".lock").exists());
+    finish(run_command(recording(), &out, &[])).succeeded();
 }
 
 #[test]

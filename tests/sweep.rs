@@ -3,12 +3,13 @@
 mod common;
 
 use common::recording::{Finished, finish, keysplat, recording, scratch, skipped_without_adapter};
+use keysplat::config::Config;
+use keysplat::mapping::MappingConfig;
 use std::path::Path;
 
-fn sweep(out: &Path) -> Finished {
-    let mut command =
-        keysplat(["bench", "sweep", recording().to_str().unwrap(), "--iterations", "2,6", "--seeds", "0,1", "--out"]);
-    command.arg(out).args(["--", "--set", "mapping.window.recent=3"]);
+fn sweep(out: &Path, points: &[&str]) -> Finished {
+    let mut command = keysplat(["bench", "sweep", recording().to_str().unwrap(), "--out"]);
+    command.arg(out).args(points).args(["--", "--set", "mapping.window.recent=3"]);
     finish(command)
 }
 
@@ -22,7 +23,8 @@ fn a_sweep_is_made_once_and_compared() {
         return;
     }
     let out = scratch().join("sweep");
-    let table = sweep(&out).succeeded().stdout;
+    let points = ["--iterations", "2,6", "--seeds", "0,1"];
+    let table = sweep(&out, &points).succeeded().stdout;
     assert_eq!(table.lines().filter(|line| line.starts_with("| recording |")).count(), 2, "{table}");
     let csv = std::fs::read_to_string(out.join("sweep.csv")).unwrap();
     assert_eq!(csv.lines().count(), 5, "{csv}");
@@ -35,7 +37,7 @@ fn a_sweep_is_made_once_and_compared() {
     let made = |name: &str| std::fs::metadata(runs.join(name).join("map.ply")).unwrap().modified().unwrap();
     let (kept, lost) = (made("2-steps-0"), made("6-steps-1"));
     std::fs::remove_file(runs.join("6-steps-1/metrics.json")).unwrap();
-    sweep(&out).succeeded();
+    sweep(&out, &points).succeeded();
     assert_eq!(made("2-steps-0"), kept);
     assert!(made("6-steps-1") > lost);
 
@@ -51,6 +53,28 @@ fn a_sweep_is_made_once_and_compared() {
     std::fs::write(worse.join("sweep.json"), sweep.to_string()).unwrap();
     compare(&out, &worse).refused(&["2 figures got worse beyond the spread"]);
     compare(&worse, &out).succeeded();
+}
+
+#[test]
+fn budgets_are_swept_with_their_own_steps_or_with_all() {
+    if skipped_without_adapter() {
+        return;
+    }
+    let out = scratch().join("budgets");
+    let csv_of = |points: &[&str]| {
+        sweep(&out, points).succeeded();
+        std::fs::read_to_string(out.join("sweep.csv")).unwrap()
+    };
+    let own = csv_of(&["--budgets", "balanced,quality"]);
+    assert!(own.contains("\"recording\",\"balanced\",0,24,24,") && own.contains("\"quality\",0,"), "{own}");
+    let settings = |run: &str| Config::read(&out.join("runs/recording").join(run).join("config.toml")).unwrap().mapping;
+    let (usual, quality) = (MappingConfig::default(), settings("quality-0"));
+    assert_eq!(settings("balanced-0").iterations_per_keyframe, usual.iterations_per_keyframe);
+    assert!(quality.iterations_per_keyframe > usual.iterations_per_keyframe);
+    let all = csv_of(&["--budgets", "quality", "--iterations", "2,3"]);
+    assert!(all.lines().count() == 3 && all.contains("\"quality, 2 steps\""), "{all}");
+    let few = settings("quality--3-steps-0");
+    assert_eq!((few.iterations_per_keyframe, few.seeding.detail), (3, quality.seeding.detail));
 }
 
 #[test]

@@ -26,12 +26,8 @@ pub fn demo(args: &DemoArgs, verbosity: Verbosity) -> miette::Result<()> {
     let scene: SceneConfig = toml::from_str(SCENE).into_diagnostic()?;
     let recording = args.out.join("demo-room");
     generate::render_if_changed(&scene, &recording, verbosity)?;
-    let sequence = Some(SequenceConfig {
-        path: std::path::absolute(recording).into_diagnostic()?,
-        layout: None,
-        sensor: None,
-        camera: None,
-    });
+    let path = std::path::absolute(recording).into_diagnostic()?;
+    let sequence = Some(SequenceConfig { path, ..SequenceConfig::default() });
     let config = Config { sequence, map_scale: MAP_SCALE, ..Config::default() };
     let stop = Arc::new(AtomicBool::new(false));
     progress::stop_on_ctrl_c(&stop)?;

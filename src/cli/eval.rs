@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::path::PathBuf;
 
 use clap::Args;
-use keysplat::config::{Config, SequenceConfig};
+use keysplat::config::Config;
 use keysplat::evaluation::trajectory::MAX_TIME_DIFFERENCE_S;
 use keysplat::evaluation::{Exposures, Metrics, sha256_hex, write_json};
 use keysplat::export::MapFormat;
@@ -60,7 +60,7 @@ pub fn eval(args: &EvalArgs, verbosity: Verbosity) -> miette::Result<()> {
         );
     }
     let gpu = Gpu::open(config.adapter.as_deref()).into_diagnostic()?;
-    outputs::prepare_folder(&args.dir).into_diagnostic()?;
+    let _lock = outputs::prepare_folder(&args.dir).into_diagnostic()?;
     let subject = Subject {
         trajectory: &trajectory,
         keyframe_indices: frames_of(&sequence, &keyframes).into_iter().map(|(index, _)| index).collect::<BTreeSet<usize>>(),
@@ -85,8 +85,7 @@ fn resolve(args: &EvalArgs) -> miette::Result<Config> {
     let own = args.dir.join(outputs::CONFIG);
     let mut config = if own.is_file() { Config::read(&own).into_diagnostic()? } else { Config::default() };
     if let Some(path) = &args.sequence {
-        let (layout, sensor, camera) = config.sequence.take().map_or((None, None, None), |s| (s.layout, s.sensor, s.camera));
-        config.sequence = Some(SequenceConfig { path: path.clone(), layout, sensor, camera });
+        config.sequence.get_or_insert_default().path.clone_from(path);
     }
     config.map_scale = args.map_scale.unwrap_or(config.map_scale);
     config.adapter = args.adapter.clone().or(config.adapter);
@@ -153,6 +152,7 @@ fn foreign_metrics(sequence: &Sequence, config: &Config) -> Metrics {
         map_bytes: None,
         map_hash: None,
         wall_s: None,
+        resumed: 0,
         tracking_ms: None,
         mapping: None,
         peak_host_bytes: None,

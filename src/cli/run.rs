@@ -77,7 +77,7 @@ fn absolute(path: &str) -> miette::Result<String> {
 
 /// See [`Budget`].
 #[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
-enum BudgetName {
+pub enum BudgetName {
     /// Keep up with the recording's own pace: resolution and steps follow from what the adapter can do.
     Realtime,
     /// The defaults.
@@ -133,7 +133,7 @@ impl RunArgs {
         if let Some(path) = &self.sequence {
             // Absolute, so that the written configuration finds it from anywhere.
             let path = std::path::absolute(path).into_diagnostic()?;
-            config.sequence = Some(SequenceConfig { path, layout: None, sensor: None, camera: None });
+            config.sequence = Some(SequenceConfig { path, ..SequenceConfig::default() });
         }
         let sequence = config
             .sequence
@@ -204,7 +204,7 @@ pub fn replay(
         pipeline::check_first_depth(&sequence).into_diagnostic()?;
     }
     let gpu = Gpu::open(config.adapter.as_deref()).into_diagnostic()?;
-    outputs::prepare_folder(&out).into_diagnostic()?;
+    let _lock = outputs::prepare_folder(&out).into_diagnostic()?;
     let checkpoints = checkpoints(from, (&sequence, config), &gpu, &out)?;
     tracing::info!(
         sequence = sequence.name,

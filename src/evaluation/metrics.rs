@@ -36,8 +36,11 @@ pub struct Metrics {
     pub map_bytes: Option<u64>,
     /// SHA-256 of the exported map's bytes.
     pub map_hash: Option<String>,
-    /// From the first frame's reading to the finished map, without the evaluation.
+    /// From the first frame's reading to the finished map, without the evaluation; of a resumed run all parts that came to a checkpoint.
     pub wall_s: Option<f64>,
+    /// How often it was interrupted and went on from a checkpoint; parts that came to no checkpoint of their own do not count.
+    #[serde(default)]
+    pub resumed: u64,
     pub tracking_ms: Option<Times>,
     pub mapping: Option<MappingFigures>,
     pub peak_host_bytes: Option<u64>,
@@ -242,7 +245,8 @@ impl fmt::Display for Metrics {
         let gaussians = self.gaussians.map_or_else(|| "–".into(), |n| n.to_string());
         row("Gaussians", format!("{gaussians}   map on disk {}", mebibytes(self.map_bytes)))?;
         row("map hash", self.map_hash.clone().unwrap_or_else(|| "–".into()))?;
-        row("whole run", cell(self.wall_s, 1, "s"))?;
+        let resumed = if self.resumed > 0 { format!("   resumed {}×", self.resumed) } else { String::new() };
+        row("whole run", cell(self.wall_s, 1, "s") + &resumed)?;
         let tracking = self.tracking_ms.map(|t| format!("median {:.1} ms   p95 {:.1} ms   max {:.1} ms", t.median, t.p95, t.max));
         row("tracking per frame", tracking.unwrap_or_else(|| "–".into()))?;
         row("mapping", self.mapping.map_or_else(|| "–".into(), |mapping| mapping.to_string()))?;
@@ -272,7 +276,7 @@ impl fmt::Display for Adapter {
 mod tests {
     use super::*;
 
-    /// The example of the protocol, field for field, and what it leaves out: two counts of a paced replay, the map's own colours.
+    /// The example of the protocol, field for field, and what it leaves out: counts of paced and resumed replays, the map's own colours.
     const EXAMPLE: &str = r#"{ "sequence": "redkitchen", "sensor": "rgbd", "paced": false, "frames": 600, "frames_read_failed": 0,
       "frames_tracked": 600, "frames_late": 0, "keyframes_deferred": 0, "keyframes": 61,
       "ate_rmse_m": {"all_frames": 0.01, "keyframes": 0.01}, "rpe": {"trans_m_per_frame": 0.002, "rot_deg_per_frame": 0.1},
@@ -281,7 +285,7 @@ mod tests {
                  "all_frames": {"count": 600, "psnr_db": 24.5, "ssim": 0.86, "depth_l1_m": 0.02},
                  "monogs":     {"count": 110, "psnr_db": 24.1, "ssim": 0.85, "depth_l1_m": 0.02}},
       "gaussians": 60000, "map_bytes": 3000000, "map_hash": "00ff",
-      "wall_s": 90.0, "tracking_ms": {"median": 20.0, "p95": 30.0, "max": 50.0},
+      "wall_s": 90.0, "resumed": 0, "tracking_ms": {"median": 20.0, "p95": 30.0, "max": 50.0},
       "mapping": {"iterations": 1800, "iterations_per_frame": 3.0, "ms_per_iteration": {"median": 40.0, "p95": 60.0},
                   "map_width": 320, "map_height": 240},
       "peak_host_bytes": 900000000, "peak_gpu_bytes": 200000000,
@@ -312,12 +316,14 @@ mod tests {
     }
 
     #[test]
-    fn the_table_shows_lost_frames_beside_the_error() {
+    fn the_table_shows_lost_frames_and_interruptions_beside_the_figures() {
         let mut metrics: Metrics = serde_json::from_str(EXAMPLE).unwrap();
-        metrics.frames_tracked = 570;
+        assert!(metrics.to_string().contains("whole run             90.0 s\n"), "{metrics}");
+        (metrics.frames_tracked, metrics.resumed) = (570, 2);
         metrics.images.held_out = None;
         let table = metrics.to_string();
         assert!(table.contains("ATE RMSE              1.00 cm   lost frames 5.0 %\n"), "{table}");
+        assert!(table.contains("whole run             90.0 s   resumed 2×\n"), "{table}");
         assert!(table.contains("held-out images       –\n"), "{table}");
         assert!(table.contains("PSNR 24.50 dB   SSIM 0.8600   depth L1 2.00 cm   (600 images)\n"), "{table}");
     }

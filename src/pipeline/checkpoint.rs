@@ -54,8 +54,16 @@ pub(super) struct Course {
     records: Vec<(KeyframeReport, [f64; 2], usize, Option<u64>)>,
     /// What the tracker was told after each keyframe.
     pub told: Vec<Vec<RefinedPair>>,
-    /// Time of the run so far, all of its parts.
+    pub parts: Parts,
+}
+
+/// What a run was made in, up to a checkpoint.
+#[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
+pub(super) struct Parts {
+    /// Time of all of them.
     pub wall_s: f64,
+    /// How often it went on from a checkpoint.
+    pub resumed: u64,
 }
 
 /// A checkpoint that was read; which run it is of has not been looked at.
@@ -98,10 +106,10 @@ impl Course {
         heard: Heard,
         mapper: MapperState,
         (records, told): (&[KeyframeRecord], &[Vec<RefinedPair>]),
-        wall_s: f64,
+        parts: Parts,
     ) -> Self {
         let records = records.iter().map(|r| (r.report, [r.done_s, r.busy_s], r.waiting, r.host_bytes)).collect();
-        Self { heard, mapper, records, told: told.to_vec(), wall_s }
+        Self { heard, mapper, records, told: told.to_vec(), parts }
     }
 
     pub fn records(&self) -> Vec<KeyframeRecord> {

@@ -6,7 +6,7 @@ use std::time::Instant;
 
 use crossbeam::channel::Receiver;
 
-use super::checkpoint::{Checkpoint, CheckpointError, Course, Identity};
+use super::checkpoint::{Checkpoint, CheckpointError, Course, Identity, Parts};
 use super::heard::Heard;
 use super::measurements::Teller;
 use super::messages::guarded;
@@ -30,8 +30,8 @@ pub struct Checkpoints {
     from: Option<Course>,
     heard: Heard,
     told: Vec<Vec<RefinedPair>>,
-    /// Time of the run's earlier parts.
-    earlier_s: f64,
+    /// Before this process.
+    earlier: Parts,
     started: Instant,
     failed: bool,
 }
@@ -44,7 +44,7 @@ impl Checkpoints {
     pub fn begin(path: &Path, (sequence, config): (&Sequence, &Config), gpu: &Gpu) -> Result<Self, ExportError> {
         let identity = Identity::of(sequence, config, gpu);
         Checkpoint::write(path, &identity, None)?;
-        Ok(Self::new(path, identity, config, None))
+        Ok(Self::new(path, identity, config, (None, Parts::default())))
     }
 
     /// For a run that goes on.
@@ -54,10 +54,12 @@ impl Checkpoints {
     pub fn resume(checkpoint: Checkpoint, (sequence, config): (&Sequence, &Config), gpu: &Gpu) -> Result<Self, CheckpointError> {
         let identity = Identity::of(sequence, config, gpu);
         checkpoint.identity.check(&checkpoint.path, &identity)?;
-        Ok(Self::new(&checkpoint.path, identity, config, checkpoint.course))
+        let mut earlier = checkpoint.course.as_ref().map_or_else(Parts::default, |course| course.parts);
+        earlier.resumed += 1;
+        Ok(Self::new(&checkpoint.path, identity, config, (checkpoint.course, earlier)))
     }
 
-    fn new(path: &Path, identity: Identity, config: &Config, from: Option<Course>) -> Self {
+    fn new(path: &Path, identity: Identity, config: &Config, (from, earlier): (Option<Course>, Parts)) -> Self {
         Self {
             path: path.into(),
             identity,
@@ -65,16 +67,16 @@ impl Checkpoints {
             since: 0,
             heard: Heard::default(),
             told: Vec::new(),
-            earlier_s: from.as_ref().map_or(0.0, |course| course.wall_s),
+            earlier,
             from,
             started: Instant::now(),
             failed: false,
         }
     }
 
-    /// Time of the run's earlier parts, seconds.
-    pub(super) fn earlier_s(&self) -> f64 {
-        self.earlier_s
+    /// The run before this process, and that this one goes on from it.
+    pub(super) fn earlier(&self) -> Parts {
+        self.earlier
     }
 
     /// Whether there is a checkpoint to catch up with.
@@ -101,8 +103,9 @@ impl Checkpoints {
         self.since = 0;
         let began = Instant::now();
         let written = guarded("mapping", || {
-            let wall_s = self.earlier_s + self.started.elapsed().as_secs_f64();
-            let course = Course::new(self.heard, mapper.state(refinement)?, (records, &self.told), wall_s);
+            let wall_s = self.earlier.wall_s + self.started.elapsed().as_secs_f64();
+            let parts = Parts { wall_s, ..self.earlier };
+            let course = Course::new(self.heard, mapper.state(refinement)?, (records, &self.told), parts);
             Ok(Checkpoint::write(&self.path, &self.identity, Some(&course))?)
         });
         match written {

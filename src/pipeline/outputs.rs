@@ -7,7 +7,7 @@ use std::sync::Arc;
 use image::{GenericImage, RgbImage};
 use serde::Serialize;
 
-use super::Outcome;
+use super::{FolderLock, Outcome};
 use crate::config::Config;
 use crate::evaluation::metrics::{Adapter, AteFigures, MappingFigures, Metrics, RpeFigures, Times, UsualTimes};
 use crate::evaluation::views::{ComparedView, ViewSelection, evaluate_views};
@@ -42,6 +42,8 @@ const MAX_PICTURES: usize = 100;
 pub enum OutputError {
     #[error("cannot create the output folder {path}: {source}; choose another with --out")]
     Folder { path: PathBuf, source: std::io::Error },
+    #[error("another keysplat is at work in {path}; wait until it has ended, or choose another folder")]
+    Busy { path: PathBuf },
     #[error("cannot remove {path}, which is of an earlier run: {source}; choose another folder with --out")]
     Remove { path: PathBuf, source: std::io::Error },
     #[error("cannot draw the trajectory: {0}; please report this")]
@@ -54,14 +56,15 @@ pub enum OutputError {
     Gpu(#[from] GpuError),
 }
 
-/// Creates the folder and checks that it can be written to, before any work starts.
-pub fn prepare_folder(out: &Path) -> Result<(), OutputError> {
+/// Creates the folder, takes it for this process alone, and checks that it can be written to, before any work starts.
+pub fn prepare_folder(out: &Path) -> Result<FolderLock, OutputError> {
     let probe = out.join(".writable");
+    let folder_error = |source| OutputError::Folder { path: out.into(), source };
+    std::fs::create_dir_all(out.join(VIEWS)).map_err(folder_error)?;
+    let lock = FolderLock::take(out)?;
     remove_partials(out);
-    std::fs::create_dir_all(out.join(VIEWS))
-        .and_then(|()| std::fs::write(&probe, b""))
-        .and_then(|()| std::fs::remove_file(&probe))
-        .map_err(|source| OutputError::Folder { path: out.into(), source })
+    std::fs::write(&probe, b"").and_then(|()| std::fs::remove_file(&probe)).map_err(folder_error)?;
+    Ok(lock)
 }
 
 /// Removes the checkpoint of a run that is finished.
@@ -234,6 +237,7 @@ pub fn write_metrics(
         map_bytes: Some(map.bytes),
         map_hash: Some(map.hash),
         wall_s: Some(outcome.wall_s),
+        resumed: outcome.resumed,
         tracking_ms: Times::of(&outcome.tracking_ms),
         mapping: Some(MappingFigures {
             iterations,

@@ -7,6 +7,7 @@ use std::time::Instant;
 
 use crossbeam::channel::bounded;
 
+use super::checkpoint::Parts;
 use super::known_poses;
 use super::map_thread::{self, MapSummary};
 use super::measurements;
@@ -42,7 +43,10 @@ pub struct Outcome {
     pub keyframes_deferred: usize,
     pub tracking_ms: Vec<f64>,
     pub step_ms: Vec<f64>,
+    /// All parts of a run that was resumed, as far as they came to a checkpoint.
     pub wall_s: f64,
+    /// How often it went on from a checkpoint.
+    pub resumed: u64,
     /// What ended the replay early.
     pub error: Option<PipelineError>,
 }
@@ -96,7 +100,7 @@ pub fn run(
     checkpoints: Option<Checkpoints>,
 ) -> Result<Outcome, PipelineError> {
     let started = Instant::now();
-    let earlier_s = checkpoints.as_ref().map_or(0.0, Checkpoints::earlier_s);
+    let mut parts = checkpoints.as_ref().map_or_else(Parts::default, Checkpoints::earlier);
     let paced = config.replay.paced;
     let (frame_sender, frames) = bounded(if paced { 1 } else { FRAMES_AHEAD });
     let (message_sender, messages) = bounded(MESSAGES_AHEAD);
@@ -129,8 +133,8 @@ pub fn run(
         let cause = track.map_or_else(Some, |track| track.error);
         return Err(cause.or(error).expect("who falls behind says why"));
     }
-    let wall_s = earlier_s + started.elapsed().as_secs_f64();
-    Ok(outcome(sequence, wall_s, read, track, map))
+    parts.wall_s += started.elapsed().as_secs_f64();
+    Ok(outcome(sequence, parts, read, track, map))
 }
 
 fn join<T>(thread: &'static str, handle: ScopedJoinHandle<'_, T>) -> Result<T, PipelineError> {
@@ -139,7 +143,7 @@ fn join<T>(thread: &'static str, handle: ScopedJoinHandle<'_, T>) -> Result<T, P
 
 fn outcome(
     sequence: &Sequence,
-    wall_s: f64,
+    Parts { wall_s, resumed }: Parts,
     read: Result<ReadSummary, PipelineError>,
     track: Result<TrackSummary, PipelineError>,
     map: Result<MapSummary, PipelineError>,
@@ -170,6 +174,7 @@ fn outcome(
         keyframes_deferred: track.deferred,
         step_ms: map.step_ms,
         wall_s,
+        resumed,
         error: errors.into_iter().next(),
     }
 }

@@ -17,6 +17,8 @@ use crate::geometry::{Camera, Distortion, Pinhole, Se3, StampedPose, Trajectory}
 
 /// Left and right further apart than this do not belong together: the cameras are triggered by one signal.
 const MAX_PAIR_NS: u64 = 1_000_000;
+/// Values in a `sensor.yaml`; the datasets' have about 50.
+const MAX_NODES: usize = 10_000;
 
 pub(super) fn recognise(folder: &Path) -> bool {
     folder.join("mav0/cam0/data.csv").is_file()
@@ -84,8 +86,14 @@ struct Matrix {
 /// A camera, and its pose in the body's frame, from a `sensor.yaml`; `path` is named in errors.
 pub(super) fn parse_sensor(text: &str, path: &Path) -> Result<(Camera, Se3), SequenceError> {
     let content = |what: String| SequenceError::Content { path: path.into(), what };
-    let file: SensorFile = serde_saphyr::from_str(text).map_err(|error| {
-        let what = error.without_snippet().to_string();
+    // A calibration needs no anchors, and aliases of aliases may stand for more than any memory holds.
+    let budget = serde_saphyr::budget! { max_anchors: 0, max_aliases: 0, max_nodes: MAX_NODES };
+    let options = serde_saphyr::options! { budget: budget };
+    let file: SensorFile = serde_saphyr::from_str_with_options(text, options).map_err(|error| {
+        let what = match error.without_snippet() {
+            serde_saphyr::Error::Budget { .. } => "anchors, aliases, or more values than a calibration has".into(),
+            error => error.to_string(),
+        };
         match error.location() {
             Some(place) => SequenceError::Syntax { path: path.into(), line: place.line() as usize, what },
             None => content(what),
@@ -319,6 +327,7 @@ mod tests {
         refused(spoil("cam0/sensor.yaml", "radial-tangential", "equidistant"), "equidistant lenses");
         refused(spoil("cam0/sensor.yaml", "intrinsics: [458.654", "intrinsics: [x"), "cam0/sensor.yaml:14: ");
         refused(spoil("cam0/sensor.yaml", "intrinsics", "extrinsics"), "sensor.yaml");
+        refused(spoil("cam0/sensor.yaml", "resolution: [", "resolution: &size ["), "sensor.yaml:12: anchors, aliases");
         refused(spoil("cam0/sensor.yaml", "[752, 480]", "[60000, 60000]"), "is 752x480, but the camera is 60000x60000");
         refused(spoil("cam1/sensor.yaml", "[752, 480]", "[480, 480]"), "different sizes");
         refused(spoil("cam1/sensor.yaml", "0.0125552670891", "0.5"), "T_BS: the first three columns are no rotation");
