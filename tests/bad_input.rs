@@ -289,7 +289,8 @@ fn a_full_disk() {
     assert_eq!(stamps(&out.join("trajectory.txt")).len(), FRAMES);
     let mut left: Vec<_> = std::fs::read_dir(&out).unwrap().map(|entry| entry.unwrap().file_name()).collect();
     left.sort();
-    assert_eq!(left, ["config.toml", "exposures.json", "history.json", "keyframes.txt", "trajectory.txt", "views"]);
+    let expected = [".lock", "config.toml", "exposures.json", "history.json", "keyframes.txt", "trajectory.txt", "views"];
+    assert_eq!(left, expected);
 
     let scene = write("scene-for-the-disk.toml", &scene().to_toml());
     let target = disk.0.path().join("recording");

@@ -140,8 +140,9 @@ fn a_camera_that_adapts() {
             picture.save(color_file(copy, frame)).unwrap();
         }
     };
-    let steps = ["--set", "mapping.first_iterations=60", "--set", "mapping.iterations_per_keyframe=20"];
-    let run = Run::of("adapting", adapt, &steps);
+    let settings = ["mapping.first_iterations=60", "mapping.iterations_per_keyframe=20", "mapping.exposure.pull=0"];
+    let settings: Vec<&str> = settings.iter().flat_map(|setting| ["--set", setting]).collect();
+    let run = Run::of("adapting", adapt, &settings);
     run.good_map(19.0).true_poses(0.03);
     let out = scratch().join("adapting-out");
     let found = Exposures::parse(&std::fs::read_to_string(out.join("exposures.json")).unwrap()).unwrap();

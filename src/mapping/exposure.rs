@@ -17,13 +17,16 @@ pub struct ExposureConfig {
     pub enabled: bool,
     /// Weight of the last keyframe's exposure against what is measured, as a share of the image's pixels.
     pub prior_share: f32,
+    /// Share of each log gain that is given up again: what lasts becomes the map's own, and errors do not add up from keyframe to keyframe (lenses
+    /// darken corners, so that what comes into view from there seems to brighten all the time).
+    pub pull: f32,
     /// Largest change of a channel's log gain from one keyframe to the next; more is taken for something else.
     pub max_change: f32,
 }
 
 impl Default for ExposureConfig {
     fn default() -> Self {
-        Self { enabled: true, prior_share: 0.1, max_change: 0.7 }
+        Self { enabled: true, prior_share: 0.1, pull: 0.3, max_change: 0.7 }
     }
 }
 
@@ -31,11 +34,10 @@ impl ExposureConfig {
     /// Says what is wrong with the values, if anything.
     pub fn validate(&self) -> Result<(), String> {
         let positive = |v: f32| v.is_finite() && v > 0.0;
-        if positive(self.prior_share) && positive(self.max_change) {
-            Ok(())
-        } else {
-            Err("prior_share and max_change must be positive".into())
+        if !(positive(self.prior_share) && positive(self.max_change)) {
+            return Err("prior_share and max_change must be positive".into());
         }
+        if (0.0..1.0).contains(&self.pull) { Ok(()) } else { Err("pull must lie between 0 and 1".into()) }
     }
 }
 
@@ -61,7 +63,8 @@ pub(super) fn measure(image: &RgbImage, rendered: &Rendered, last: &Exposure, co
         let (_, median, _) = ratios.select_nth_unstable_by(count / 2, f32::total_cmp);
         let trust = count as f32 / (count as f32 + config.prior_share * rendered.color_depth.len() as f32);
         let change = *median - last.0[k];
-        if change.abs() <= config.max_change { last.0[k] + trust * change } else { last.0[k] }
+        let found = if change.abs() <= config.max_change { last.0[k] + trust * change } else { last.0[k] };
+        (1.0 - config.pull) * found
     };
     Exposure([channel(0), channel(1), channel(2)])
 }
@@ -99,7 +102,7 @@ mod tests {
     fn the_gains_are_found_and_taken_out() {
         let gains = [1.2, 1.0, 0.85];
         let (image, rendered) = pair(gains);
-        let config = ExposureConfig { prior_share: 1e-6, ..ExposureConfig::default() };
+        let config = ExposureConfig { prior_share: 1e-6, pull: 0.0, ..ExposureConfig::default() };
         let exposure = measure(&image, &rendered, &Exposure::default(), &config);
         assert!((exposure.gains() - glam::Vec3::from(gains)).abs().max_element() < 0.01, "{exposure:?}");
         let corrected = corrected(&image, &exposure);
@@ -112,7 +115,7 @@ mod tests {
     #[test]
     fn what_little_is_seen_moves_it_little_and_a_leap_not_at_all() {
         let (image, mut rendered) = pair([1.2; 3]);
-        let config = ExposureConfig::default();
+        let config = ExposureConfig { pull: 0.0, ..ExposureConfig::default() };
         let last = Exposure([0.1; 3]);
         let whole = measure(&image, &rendered, &last, &config);
         let only = |i: usize| i.is_multiple_of(32);
