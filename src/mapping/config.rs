@@ -38,7 +38,7 @@ impl Default for MappingConfig {
     fn default() -> Self {
         Self {
             sh_degree: ShDegree::new(2).expect("degrees 0 to 3 exist"),
-            iterations_per_keyframe: 50,
+            iterations_per_keyframe: 30,
             first_iterations: 100,
             yields_to_keyframes: false,
             seed: 0,
@@ -143,7 +143,7 @@ impl Default for SeedingConfig {
     fn default() -> Self {
         Self {
             stride: 2,
-            flat_stride: 8,
+            flat_stride: 4,
             detail: 0.05,
             min_alpha: 0.6,
             depth_disagreement: 0.06,

@@ -24,7 +24,8 @@ use crate::sequence::{Sensor, Sequence};
 use crate::splat::GaussianCloud;
 use crate::tracking::KeyframePose;
 
-/// Frames decoded ahead of the tracker; paced replay keeps just the one that is due.
+/// Frames decoded ahead of the tracker; in paced replay those that are due and wait: the tracker may take long for one, a keyframe say, and
+/// catches up in the next ones.
 const FRAMES_AHEAD: usize = 4;
 /// Keyframes and pose updates that may wait for the mapper. Few, so that the map never lags far behind the camera.
 const MESSAGES_AHEAD: usize = 4;
@@ -102,7 +103,7 @@ pub fn run(
     let started = Instant::now();
     let mut parts = checkpoints.as_ref().map_or_else(Parts::default, Checkpoints::earlier);
     let paced = config.replay.paced;
-    let (frame_sender, frames) = bounded(if paced { 1 } else { FRAMES_AHEAD });
+    let (frame_sender, frames) = bounded(FRAMES_AHEAD);
     let (message_sender, messages) = bounded(MESSAGES_AHEAD);
     let (teller, listener) = measurements::channel(config);
     let mapping = &known_poses::mapping_config(sequence, config);
