@@ -1,4 +1,4 @@
-//! A keyframe's exposure against the map's, which is that of the first keyframe, and the image as it would be in the map's.
+//! A keyframe's exposure against the map's, which began as that of the first keyframe, and the image as it would be in the map's.
 //!
 //! It is measured once, when the keyframe comes, on the render that seeding asks for anyway: the median ratio of image and render over the
 //! pixels that both show well, in each channel. The map then learns from corrected images, and loss, seeds and scores know nothing of it.
@@ -17,8 +17,8 @@ pub struct ExposureConfig {
     pub enabled: bool,
     /// Weight of the last keyframe's exposure against what is measured, as a share of the image's pixels.
     pub prior_share: f32,
-    /// Share of each log gain that is given up again: what lasts becomes the map's own, and errors do not add up from keyframe to keyframe (lenses
-    /// darken corners, so that what comes into view from there seems to brighten all the time).
+    /// Share of each log gain that is given up again: what lasts becomes the map's own, and errors do not add up from keyframe to
+    /// keyframe (lenses darken corners, so that what comes into view from there seems to brighten all the time).
     pub pull: f32,
     /// Largest change of a channel's log gain from one keyframe to the next; more is taken for something else.
     pub max_change: f32,

@@ -9,7 +9,7 @@ use crossbeam::channel::{bounded, unbounded};
 
 use super::map_thread::{self, MapSummary, Round};
 use super::measurements::{Listener, Teller};
-use super::run::exposures;
+use super::run::{FRAMES_AHEAD, exposures};
 use super::{MapperMessage, PipelineError, Progress, known_poses, read_thread, track_thread};
 use crate::config::Config;
 use crate::evaluation::Exposures;
@@ -19,8 +19,6 @@ use crate::mapping::MappingConfig;
 use crate::sequence::Sequence;
 use crate::splat::GaussianCloud;
 use crate::tracking::KeyframePose;
-
-const FRAMES_AHEAD: usize = 4;
 
 /// A tracked sequence.
 #[derive(Clone, Debug)]

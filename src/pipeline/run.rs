@@ -26,7 +26,7 @@ use crate::tracking::KeyframePose;
 
 /// Frames decoded ahead of the tracker; in paced replay those that are due and wait: the tracker may take long for one, a keyframe say, and
 /// catches up in the next ones.
-const FRAMES_AHEAD: usize = 8;
+pub(super) const FRAMES_AHEAD: usize = 8;
 /// Keyframes and pose updates that may wait for the mapper. Few, so that the map never lags far behind the camera.
 const MESSAGES_AHEAD: usize = 4;
 
