@@ -1,4 +1,4 @@
-// Gathers the visible Gaussians, in map order, as (depth key, index) pairs for the depth sort.
+// Gathers the visible Gaussians in map order: as a list, and as (depth key, index) pairs for the depth sort.
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<storage, read> visible: array<u32>;
@@ -6,6 +6,7 @@
 @group(0) @binding(3) var<storage, read> projected: array<vec4<f32>>;
 @group(0) @binding(4) var<storage, read_write> depth_keys: array<u32>;
 @group(0) @binding(5) var<storage, read_write> indices: array<u32>;
+@group(0) @binding(6) var<storage, read_write> seen: array<u32>;
 
 @compute @workgroup_size(256)
 fn main(
@@ -18,6 +19,8 @@ fn main(
         return;
     }
     // The bits of positive floats sort as integers.
-    depth_keys[prefix[i]] = bitcast<u32>(projected[i].z);
-    indices[prefix[i]] = i;
+    let to = prefix[i];
+    depth_keys[to] = bitcast<u32>(projected[3u * i].z);
+    indices[to] = i;
+    seen[to] = i;
 }

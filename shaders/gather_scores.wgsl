@@ -2,8 +2,9 @@
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<storage, read> counters: array<Counter>;
-@group(0) @binding(2) var<storage, read> order: array<u32>;
-@group(0) @binding(3) var<storage, read> pair_offsets: array<u32>;
+@group(0) @binding(2) var<storage, read> seen: array<u32>;
+// See `tile_lists`.
+@group(0) @binding(3) var<storage, read> pair_counts: array<u32>;
 @group(0) @binding(4) var<storage, read> pair_scores: array<vec4<f32>>;
 @group(0) @binding(5) var<storage, read> projected: array<vec4<f32>>;
 // [2, capacity], see `GaussianScore`: (wrong pixels, the same times each view's loss, Σ w, largest w); (‖∂‖, ‖Σ|∂|‖ in normalised
@@ -25,38 +26,35 @@ fn main(
     @builtin(num_workgroups) workgroups: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
 ) {
-    let rank = linear_workgroup(workgroup, workgroups) * 256u + local;
+    let item = linear_workgroup(workgroup, workgroups) * 256u + local;
     // Without room for all pairs nothing was rendered: the step will be repeated.
-    if rank >= counters[VISIBLE_COUNTER].count || counters[PAIR_COUNTER].count == 0u {
+    if item >= counters[VISIBLE_COUNTER].count || counters[PAIR_COUNTER].count == 0u {
         return;
     }
-    var end = counters[PAIR_COUNTER].count;
-    if rank + 1u < counters[VISIBLE_COUNTER].count {
-        end = pair_offsets[rank + 1u];
-    }
-    var seen = vec4(0.0);
+    let i = seen[item];
+    let end = pair_counts[view.capacity + 2u * i + 1u];
+    var blended = vec4(0.0);
     var gradient = vec4(0.0);
-    for (var slot = pair_offsets[rank]; slot < end; slot++) {
+    for (var slot = pair_counts[view.capacity + 2u * i]; slot < end; slot++) {
         let part = pair_scores[slot * 3u];
-        seen = vec4(seen.xy + part.xy, max(seen.z, part.z), 0.0);
+        blended = vec4(blended.xy + part.xy, max(blended.z, part.z), 0.0);
         gradient += pair_scores[slot * 3u + 1u];
     }
-    if seen.y == 0.0 {
+    if blended.y == 0.0 {
         return;
     }
     let values = 3.0 * setup.pixels;
     let loss = (1.0 - setup.ssim_weight) * total.x / values + setup.ssim_weight * (1.0 - total.y / values);
-    let i = order[rank];
     let per_unit = 0.5 * vec2(f32(view.width), f32(view.height));
-    let metres_per_pixel = projected[i].z / view.intrinsics.x;
+    let metres_per_pixel = projected[3u * i].z / view.intrinsics.x;
     let before = scores[view.capacity + i];
     let finest = select(metres_per_pixel, min(before.w, metres_per_pixel), before.z > 0.0);
     let seen_before = scores[i];
     scores[i] = vec4(
-        seen_before.x + seen.x,
-        seen_before.y + seen.x * loss,
-        seen_before.z + seen.y,
-        max(seen_before.w, seen.z),
+        seen_before.x + blended.x,
+        seen_before.y + blended.x * loss,
+        seen_before.z + blended.y,
+        max(seen_before.w, blended.z),
     );
     let norms = vec2(length(gradient.xy * per_unit), length(gradient.zw * per_unit));
     scores[view.capacity + i] = vec4(before.xy + norms, before.z + 1.0, finest);

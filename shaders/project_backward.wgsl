@@ -1,13 +1,14 @@
 // Carries the pairs' gradients through the projection to each visible Gaussian's parameters, and to the camera pose.
 //
-// One invocation a visible Gaussian; its pairs lie side by side and are summed in order. `begin_gradient` and `store_gradient` are the sink: it steps Adam at
+// One invocation a visible Gaussian, in map order: neighbours' parameters lie side by side. A Gaussian's pairs do as well, and are summed in order. `begin_gradient` and `store_gradient` are the sink: it steps Adam at
 // once (`shared/sink_adam.wgsl`) or writes the gradient down (`shared/sink_gradient.wgsl`). The pose gradient is that of the left
 // perturbation T ← Exp(τ)·T of camera_from_world, τ = (ρ, θ).
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<storage, read> counters: array<Counter>;
-@group(0) @binding(2) var<storage, read> order: array<u32>;
-@group(0) @binding(3) var<storage, read> pair_offsets: array<u32>;
+@group(0) @binding(2) var<storage, read> seen: array<u32>;
+// See `tile_lists`.
+@group(0) @binding(3) var<storage, read> pair_counts: array<u32>;
 @group(0) @binding(4) var<storage, read> pair_gradients: array<vec4<f32>>;
 // [workgroups, 2] sums over the workgroup of (∂L/∂ρ, 0), (∂L/∂θ, 0).
 @group(0) @binding(5) var<storage, read_write> pose_sums: array<vec4<f32>>;
@@ -27,11 +28,11 @@ fn main(
     @builtin(local_invocation_index) local: u32,
 ) {
     let block = linear_workgroup(workgroup, workgroups);
-    let rank = block * 256u + local;
+    let item = block * 256u + local;
     var pose = PoseGradient(vec3(0.0), vec3(0.0));
     // Without room for all pairs nothing was rendered: the step will be repeated.
-    if rank < counters[VISIBLE_COUNTER].count && counters[PAIR_COUNTER].count > 0u {
-        pose = backward(rank);
+    if item < counters[VISIBLE_COUNTER].count && counters[PAIR_COUNTER].count > 0u {
+        pose = backward(seen[item]);
     }
     rho_sums[local] = pose.rho;
     theta_sums[local] = pose.theta;
@@ -48,15 +49,12 @@ fn main(
     }
 }
 
-fn backward(rank: u32) -> PoseGradient {
+fn backward(i: u32) -> PoseGradient {
     var color_depth = vec4(0.0);
     var first = vec4(0.0);
     var second = vec4(0.0);
-    var end = counters[PAIR_COUNTER].count;
-    if rank + 1u < counters[VISIBLE_COUNTER].count {
-        end = pair_offsets[rank + 1u];
-    }
-    for (var slot = pair_offsets[rank]; slot < end; slot++) {
+    let end = pair_counts[view.capacity + 2u * i + 1u];
+    for (var slot = pair_counts[view.capacity + 2u * i]; slot < end; slot++) {
         color_depth += pair_gradients[slot * 3u];
         first += pair_gradients[slot * 3u + 1u];
         second += pair_gradients[slot * 3u + 2u];
@@ -65,7 +63,6 @@ fn backward(rank: u32) -> PoseGradient {
     if untouched {
         return PoseGradient(vec3(0.0), vec3(0.0));
     }
-    let i = order[rank];
     let mean_opacity = parameters[i];
     let log_scale = parameters[view.capacity + i].xyz;
     let rotation = parameters[2u * view.capacity + i];
@@ -144,17 +141,11 @@ fn color_gradient(i: u32, mean: vec3<f32>, by_color: vec3<f32>) -> vec3<f32> {
     let offset = mean - view.center_in_world.xyz;
     let distance = length(offset);
     let direction = offset / distance;
-    var value = vec3(0.5);
-    for (var k = 0u; k < coefficients; k++) {
-        value += sh_basis(k, direction) * parameters[(3u + k) * view.capacity + i].xyz;
-    }
-    // A channel clamped at black has no gradient.
-    let free = select(vec3(0.0), by_color, value > vec3(0.0));
     var by_direction = vec3(0.0);
     for (var k = 0u; k < coefficients; k++) {
-        by_direction += sh_basis_gradient(k, direction) * dot(parameters[(3u + k) * view.capacity + i].xyz, free);
+        by_direction += sh_basis_gradient(k, direction) * dot(parameters[(3u + k) * view.capacity + i].xyz, by_color);
         if k == 0u || wants_harmonics() {
-            store_gradient(3u + k, i, vec4(sh_basis(k, direction) * free, 0.0));
+            store_gradient(3u + k, i, vec4(sh_basis(k, direction) * by_color, 0.0));
         }
     }
     return (by_direction - direction * dot(direction, by_direction)) / distance;

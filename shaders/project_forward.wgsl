@@ -4,7 +4,7 @@
 @group(0) @binding(0) var<uniform> view: View;
 // [planes, capacity], see `render::GpuCloud`.
 @group(0) @binding(1) var<storage, read> parameters: array<vec4<f32>>;
-// [3, capacity]: (mean x, mean y, depth, cut), (whitening xx, xy, yy, opacity),
+// [N, 3]: (mean x, mean y, depth, cut), (whitening xx, xy, yy, opacity),
 // (r, g, b, half extents of the ellipse in pixels as two f16).
 @group(0) @binding(2) var<storage, read_write> projected: array<vec4<f32>>;
 // [N] 1 where the Gaussian may touch the image.
@@ -61,9 +61,9 @@ fn project(i: u32) -> bool {
     if !all(seen < vec3(MAX_COLOR)) {
         return false;
     }
-    projected[i] = vec4(mean, depth, cut);
-    projected[view.capacity + i] = vec4(whitening(projection), opacity);
-    projected[2u * view.capacity + i] = vec4(seen, bitcast<f32>(pack2x16float(min(half_extent * EXTENT_SLACK, vec2(MAX_EXTENT)))));
+    projected[3u * i] = vec4(mean, depth, cut);
+    projected[3u * i + 1u] = vec4(whitening(projection), opacity);
+    projected[3u * i + 2u] = vec4(seen, bitcast<f32>(pack2x16float(min(half_extent * EXTENT_SLACK, vec2(MAX_EXTENT)))));
     return true;
 }
 

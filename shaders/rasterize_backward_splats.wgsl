@@ -1,26 +1,23 @@
 // The same gradients as `rasterize_backward_pixels`, in the form that suits wide SIMD units (after Mallick et al. 2024, Taming 3DGS,
-// but without their per-bucket checkpoints): each invocation keeps a Gaussian and its sums in registers, and the tile's quads of pixels
-// pass by. At each step invocation i works on the quad that invocation i - 1 has just left, so that every quad meets the Gaussians
-// in their order; an invocation that has seen all quads takes the Gaussian TILE_THREADS places further on, and no lane ever idles but
-// at the ends of the list. QUADS is 1: there are as many quads as invocations.
+// but without their per-bucket checkpoints): each invocation keeps a Gaussian and its sums in registers, and the tile's strips of pixels
+// pass by. At each step invocation i works on the strip that invocation i - 1 has just left, so that every strip meets the Gaussians
+// in their order; an invocation that has seen all strips takes the Gaussian TILE_THREADS places further on, and no lane ever idles but
+// at the ends of the list. STRIPS and GROUP_TILES are 1: there are as many strips as invocations, all of one tile.
 
-// The quads' state, in workgroup memory.
-var<workgroup> quads: array<PixelState, TILE_THREADS>;
+// The strips' state, in workgroup memory.
+var<workgroup> strips: array<PixelState, TILE_THREADS>;
 
-@compute @workgroup_size(TILE_THREADS)
+@compute @workgroup_size(THREADS)
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
 ) {
     let tile = linear_workgroup(workgroup, workgroups);
-    if tile >= view.tiles_x * view.tiles_y {
-        return;
-    }
-    let range = ranges[tile];
-    quads[local] = load_pixels(quad_of(view, tile, local));
+    let place = place_of(tile, local);
+    strips[local] = load_pixels(place, 0u);
     workgroupBarrier();
-    let count = workgroupUniformLoad(&tile_last);
+    let count = workgroupUniformLoad(&longest);
     let end = select(0u, count + TILE_THREADS - 1u, count > 0u);
 
     var mean = vec4(0.0);
@@ -29,7 +26,7 @@ fn main(
     var sum = PairGradient(vec4(0.0), vec4(0.0), vec4(0.0));
     for (var step = 0u; step < end; step++) {
         if step % TILE_THREADS == 0u && step < count {
-            load_batch(range.x + step, range.x + min(step + TILE_THREADS, count), local);
+            load_batch(place, step, min(step + TILE_THREADS, count));
             workgroupBarrier();
         }
         // Steps since invocation `local` began; it wraps before that, and is then beyond any list.
@@ -43,18 +40,19 @@ fn main(
                 color = batch_color[local];
                 sum = PairGradient(vec4(0.0), vec4(0.0), vec4(0.0));
             }
-            var pixels = quads[turn];
-            pass_gaussian(mean, shape, color, position, quad_of(view, tile, turn), &pixels, &sum);
-            quads[turn].transmittance = pixels.transmittance;
-            quads[turn].behind = pixels.behind;
+            let block = block_of(tile, turn);
+            var pixels = strips[turn];
+            add_gradient(block.x - mean.x, block.y - mean.y, mean, shape, color, position, &pixels, &sum);
+            strips[turn].transmittance = pixels.transmittance;
+            strips[turn].behind = pixels.behind;
             if turn == TILE_THREADS - 1u {
-                let slot = sorted_slots[range.x + position];
-                pair_gradients[slot * 3u] = sum.color_depth;
+                let slot = sorted_slots[place.range.x + position];
+                pair_gradients[slot * 3u] = before_clamp(color, sum.color_depth);
                 pair_gradients[slot * 3u + 1u] = sum.first;
                 pair_gradients[slot * 3u + 2u] = sum.second;
             }
         }
         workgroupBarrier();
     }
-    clear_unblended(range.x + count, range.y, local);
+    clear_unblended(place, count);
 }

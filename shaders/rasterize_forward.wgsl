@@ -1,4 +1,4 @@
-// Blends the tile's Gaussians front to back into colour, depth and transmittance (Kerbl et al. 2023, eq. 3). One workgroup a tile.
+// Blends the tiles' Gaussians front to back into colour, depth and transmittance (Kerbl et al. 2023, eq. 3).
 
 // [H, W] (r, g, b, Σ w z): colour over the background, depth weighted by what was blended.
 @group(0) @binding(5) var<storage, read_write> color_depth: array<vec4<f32>>;
@@ -6,8 +6,10 @@
 @group(0) @binding(6) var<storage, read_write> state: array<vec2<f32>>;
 
 var<workgroup> finished: atomic<u32>;
+// The longest list of the workgroup's tiles.
+var<workgroup> longest: atomic<u32>;
 
-// What a quad of pixels has blended so far.
+// What a strip of pixels has blended so far.
 struct Blended {
     red: vec4<f32>,
     green: vec4<f32>,
@@ -19,73 +21,73 @@ struct Blended {
     open: vec4<bool>,
 }
 
-@compute @workgroup_size(TILE_THREADS)
+@compute @workgroup_size(THREADS)
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
 ) {
-    let tile = linear_workgroup(workgroup, workgroups);
-    if tile >= view.tiles_x * view.tiles_y {
-        return;
-    }
-    let range = ranges[tile];
-    var quads: array<Quad, QUADS>;
-    var blended: array<Blended, QUADS>;
-    for (var q = 0u; q < QUADS; q++) {
-        quads[q] = quad_of(view, tile, local * QUADS + q);
-        blended[q].transmittance = vec4(1.0);
-        blended[q].open = quads[q].inside;
+    let place = place_of(linear_workgroup(workgroup, workgroups), local);
+    let block = place.block;
+    let count = place.range.y - place.range.x;
+    atomicMax(&longest, count);
+    var blended: array<Blended, STRIPS>;
+    for (var s = 0u; s < STRIPS; s++) {
+        blended[s].transmittance = vec4(1.0);
+        blended[s].open = block.columns & vec4(s < block.rows);
     }
     var counted = false;
 
-    for (var start = range.x; start < range.y; start += BATCH) {
+    let end = workgroupUniformLoad(&longest);
+    for (var start = 0u; start < end; start += BATCH) {
         var open = vec4(false);
-        for (var q = 0u; q < QUADS; q++) {
-            open = open | blended[q].open;
+        for (var s = 0u; s < STRIPS; s++) {
+            open = open | blended[s].open;
         }
-        if !counted && !any(open) {
+        if !counted && (!any(open) || start >= count) {
             counted = true;
             atomicAdd(&finished, 1u);
         }
         workgroupBarrier();
-        if workgroupUniformLoad(&finished) == TILE_THREADS {
+        if workgroupUniformLoad(&finished) == THREADS {
             break;
         }
-        load_batch(start, range.y, local);
+        load_batch(place, start, count);
         workgroupBarrier();
-        let end = min(BATCH, range.y - start);
-        for (var k = 0u; k < end; k++) {
-            let mean = batch_mean[k];
-            let shape = batch_whitening[k];
-            let color = batch_color[k];
-            for (var q = 0u; q < QUADS; q++) {
-                var quad = blended[q];
-                blend(mean, shape, color, start + k + 1u - range.x, quads[q], &quad);
-                blended[q] = quad;
+        for (var k = start; k < min(count, start + BATCH); k++) {
+            let at = place.member * BATCH + k - start;
+            let mean = batch_mean[at];
+            let shape = batch_whitening[at];
+            let color = batch_color[at];
+            let along = shape.x * (block.x - mean.x);
+            for (var s = 0u; s < STRIPS; s++) {
+                let dy = block.y + f32(s) - mean.y;
+                let u = along + shape.y * dy;
+                let v = shape.z * dy;
+                var strip = blended[s];
+                blend(u * u + v * v, mean, shape.w, color, k + 1u, &strip);
+                blended[s] = strip;
             }
         }
     }
-    for (var q = 0u; q < QUADS; q++) {
-        let done = blended[q];
-        for (var p = 0; p < 4; p++) {
-            if quads[q].inside[p] {
+    for (var s = 0u; s < STRIPS; s++) {
+        let done = blended[s];
+        for (var p = 0u; p < 4u; p++) {
+            if block.columns[p] && s < block.rows {
+                let at = block.first + s * view.width + p;
                 let color = vec3(done.red[p], done.green[p], done.blue[p]) + done.transmittance[p] * view.background.xyz;
-                color_depth[quads[q].index[p]] = vec4(color, done.depth[p]);
-                state[quads[q].index[p]] = vec2(done.transmittance[p], bitcast<f32>(done.last[p]));
+                color_depth[at] = vec4(color, done.depth[p]);
+                state[at] = vec2(done.transmittance[p], bitcast<f32>(done.last[p]));
             }
         }
     }
 }
 
-// Blends one Gaussian, the `number`-th of the tile, into a quad.
-fn blend(mean: vec4<f32>, shape: vec4<f32>, color: vec4<f32>, number: u32, quad: Quad, to: ptr<function, Blended>) {
-    let distance = half_distance(mean.xy, shape.xyz, quad);
+// Blends one Gaussian, the `number`-th of the tile, into a strip; `distance` is ½dᵀΣ⁻¹d: alpha is opacity·exp(-that). Nothing is left out by branches:
+// the narrow form's adapters would run both sides.
+fn blend(distance: vec4<f32>, mean: vec4<f32>, opacity: f32, color: vec4<f32>, number: u32, to: ptr<function, Blended>) {
     let hit = (*to).open & (distance <= vec4(mean.w));
-    if !any(hit) {
-        return;
-    }
-    let alpha = min(vec4(ALPHA_MAX), shape.w * exp(-distance));
+    let alpha = min(vec4(ALPHA_MAX), opacity * exp(-distance));
     let next = (*to).transmittance * (1.0 - alpha);
     let stop = hit & (next < vec4(TRANSMITTANCE_MIN));
     let taken = hit & !stop;

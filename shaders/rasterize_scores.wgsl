@@ -25,116 +25,104 @@ struct PairScore {
 }
 
 const CHUNK: u32 = 8u;
-// [CHUNK, 2, TILE_THREADS] what each invocation adds to each pair of the chunk.
-var<workgroup> partial: array<vec4<f32>, CHUNK * 2u * TILE_THREADS>;
+// [GROUP_TILES, CHUNK, 2, TILE_THREADS] what each invocation adds to each pair of the chunk.
+var<workgroup> partial: array<vec4<f32>, CHUNK * 2u * THREADS>;
 
-@compute @workgroup_size(TILE_THREADS)
+@compute @workgroup_size(THREADS)
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
 ) {
-    let tile = linear_workgroup(workgroup, workgroups);
-    if tile >= view.tiles_x * view.tiles_y {
-        return;
-    }
-    let range = ranges[tile];
+    let place = place_of(linear_workgroup(workgroup, workgroups), local);
+    let block = place.block;
     let threshold = max(setup.noise, setup.error_ratio * total.x / (3.0 * setup.pixels));
-    var quads: array<Quad, QUADS>;
-    var pixels: array<PixelState, QUADS>;
-    var wrong: array<vec4<f32>, QUADS>;
-    for (var q = 0u; q < QUADS; q++) {
-        quads[q] = quad_of(view, tile, local * QUADS + q);
-        pixels[q] = load_pixels(quads[q]);
-        wrong[q] = wrong_pixels(quads[q], threshold);
+    var pixels: array<PixelState, STRIPS>;
+    var wrong: array<vec4<f32>, STRIPS>;
+    for (var s = 0u; s < STRIPS; s++) {
+        pixels[s] = load_pixels(place, s);
+        wrong[s] = wrong_pixels(place, s, threshold);
     }
     workgroupBarrier();
-    let blended_end = range.x + workgroupUniformLoad(&tile_last);
+    let end = workgroupUniformLoad(&longest);
+    let blended = atomicLoad(&tile_last[place.member]);
+    let partials = place.member * CHUNK * 2u * TILE_THREADS;
 
-    for (var start = range.x; start < blended_end; start += BATCH) {
+    for (var start = 0u; start < end; start += BATCH) {
         workgroupBarrier();
-        load_batch(start, blended_end, local);
+        load_batch(place, start, blended);
         workgroupBarrier();
-        let end = min(BATCH, blended_end - start);
-        for (var chunk = 0u; chunk < end; chunk += CHUNK) {
-            let count = min(CHUNK, end - chunk);
-            for (var k = 0u; k < count; k++) {
-                let mean = batch_mean[chunk + k];
-                let shape = batch_whitening[chunk + k];
-                let color = batch_color[chunk + k];
+        for (var chunk = start; chunk < min(end, start + BATCH); chunk += CHUNK) {
+            let chunk_end = min(blended, chunk + CHUNK);
+            for (var k = chunk; k < chunk_end; k++) {
+                let at = place.member * BATCH + k - start;
+                let mean = batch_mean[at];
+                let shape = batch_whitening[at];
+                let color = batch_color[at];
+                let dx = block.x - mean.x;
                 var sum = PairScore(vec4(0.0), vec4(0.0));
-                for (var q = 0u; q < QUADS; q++) {
-                    var quad = pixels[q];
-                    score_gaussian(mean, shape, color, start + chunk + k - range.x, quads[q], wrong[q], &quad, &sum);
-                    pixels[q] = quad;
+                for (var s = 0u; s < STRIPS; s++) {
+                    var strip = pixels[s];
+                    add_score(dx, block.y + f32(s) - mean.y, mean, shape, color, k, wrong[s], &strip, &sum);
+                    pixels[s] = strip;
                 }
-                let to = k * 2u * TILE_THREADS + local;
+                let to = partials + (k - chunk) * 2u * TILE_THREADS + place.thread;
                 partial[to] = sum.seen;
                 partial[to + TILE_THREADS] = sum.gradient;
             }
             workgroupBarrier();
-            for (var item = local; item < count * 2u; item += TILE_THREADS) {
+            for (var item = place.thread; chunk + item / 2u < chunk_end; item += TILE_THREADS) {
                 var sum = vec4(0.0);
                 var largest = 0.0;
                 for (var i = 0u; i < TILE_THREADS; i++) {
-                    let part = partial[item * TILE_THREADS + i];
+                    let part = partial[partials + item * TILE_THREADS + i];
                     sum += part;
                     largest = max(largest, part.z);
                 }
                 if item % 2u == 0u {
                     sum.z = largest;
                 }
-                let slot = sorted_slots[start + chunk + item / 2u];
+                let slot = sorted_slots[place.range.x + chunk + item / 2u];
                 pair_gradients[slot * 3u + item % 2u] = sum;
             }
             workgroupBarrier();
         }
     }
-    clear_unblended(blended_end, range.y, local);
+    clear_unblended(place, blended);
 }
 
-// 1 where the pixel's error exceeds the threshold.
-fn wrong_pixels(quad: Quad, threshold: f32) -> vec4<f32> {
+// 1 where the error of a strip's pixel exceeds the threshold.
+fn wrong_pixels(place: Place, strip: u32, threshold: f32) -> vec4<f32> {
+    let errors = view.width * view.height + place.block.first + strip * view.width;
     var wrong = vec4(0.0);
-    for (var p = 0; p < 4; p++) {
-        if quad.inside[p] && image_gradients[view.width * view.height + quad.index[p]].y > threshold {
+    for (var p = 0u; p < 4u; p++) {
+        if place.block.columns[p] && strip < place.block.rows && image_gradients[errors + p].y > threshold {
             wrong[p] = 1.0;
         }
     }
     return wrong;
 }
 
-// Takes a quad past one Gaussian as `pass_gaussian` does, and adds to its score.
-fn score_gaussian(
+// Takes a strip past one Gaussian as `add_gradient` does, and adds to its score.
+fn add_score(
+    dx: vec4<f32>,
+    dy: f32,
     mean: vec4<f32>,
     shape: vec4<f32>,
     color: vec4<f32>,
     position: u32,
-    quad: Quad,
     wrong: vec4<f32>,
     pixels: ptr<function, PixelState>,
     sum: ptr<function, PairScore>,
 ) {
-    let dy = quad.y - mean.y;
-    let u = shape.x * (quad.x - mean.x) + shape.y * dy;
+    let u = shape.x * dx + shape.y * dy;
     let v = shape.z * dy;
-    let distance = u * u + v * v;
-    let hit = (distance <= vec4(mean.w)) & (vec4(position) < (*pixels).last);
-    if !any(hit) {
-        return;
-    }
-    let unbounded = shape.w * exp(-distance);
-    let alpha = select(vec4(0.0), min(vec4(ALPHA_MAX), unbounded), hit);
-    let value = (*pixels).red * color.x + (*pixels).green * color.y + (*pixels).blue * color.z + (*pixels).depth * mean.z;
-    let weight = alpha * (*pixels).transmittance;
-    (*pixels).behind -= weight * value;
-    let gradient_alpha = (*pixels).transmittance * value - (*pixels).behind / (1.0 - alpha);
-    (*pixels).transmittance *= 1.0 - alpha;
-    let q = select(vec4(0.0), gradient_alpha * alpha, hit & (unbounded <= vec4(ALPHA_MAX)));
-    let by_x = 2.0 * q * shape.x * u;
-    let by_y = 2.0 * q * (shape.y * u + shape.z * v);
+    let passed = pass_gaussian(u, v, mean, shape.w, color, position, pixels);
+    let weight = passed.weight;
+    let by_x = 2.0 * passed.q * shape.x * u;
+    let by_y = 2.0 * passed.q * (shape.y * u + shape.z * v);
     let ones = vec4(1.0);
-    let blended = select(vec4(0.0), wrong, hit);
+    let blended = select(vec4(0.0), wrong, passed.hit);
     let largest = max(max(weight.x, weight.y), max(weight.z, weight.w));
     let before = (*sum).seen;
     (*sum).seen = vec4(before.x + dot(blended, ones), before.y + dot(weight, ones), max(before.z, largest), 0.0);

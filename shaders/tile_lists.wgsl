@@ -13,8 +13,10 @@ struct TileListsSetup {
 @group(0) @binding(2) var<storage, read> counters: array<Counter>;
 @group(0) @binding(3) var<storage, read> order: array<u32>;
 @group(0) @binding(4) var<storage, read> projected: array<vec4<f32>>;
-// [visible] tiles of each Gaussian (mode 0), and where its pairs begin (mode 1).
+// [visible] tiles of each Gaussian, nearest first (mode 0); behind them, from `capacity` on, its first slot and that past its last, in map
+// order (mode 1).
 @group(0) @binding(5) var<storage, read_write> pair_counts: array<u32>;
+// [visible] where each Gaussian's slots begin, nearest first.
 @group(0) @binding(6) var<storage, read> pair_offsets: array<u32>;
 // [pairs] tile, and the pair's slot, before the tile sort.
 @group(0) @binding(7) var<storage, read_write> tile_keys: array<u32>;
@@ -37,11 +39,11 @@ fn main(
         return;
     }
     let gaussian = order[rank];
-    let mean_cut = projected[gaussian];
-    let whitening = projected[view.capacity + gaussian].xyz;
+    let mean_cut = projected[3u * gaussian];
+    let whitening = projected[3u * gaussian + 1u].xyz;
     let limit = mean_cut.w * (1.0 + SLACK) + SLACK;
     let mean = mean_cut.xy;
-    let half_extent = unpack2x16float(bitcast<u32>(projected[2u * view.capacity + gaussian].w));
+    let half_extent = unpack2x16float(bitcast<u32>(projected[3u * gaussian + 2u].w));
     let last_tile = vec2<f32>(f32(view.tiles_x), f32(view.tiles_y)) - 1.0;
     let tile_size = vec2(f32(TILE_WIDTH), f32(TILE_HEIGHT));
     // Pixel centres are integers, so a tile's pixels span [first, first + size - 1].
@@ -72,6 +74,9 @@ fn main(
     }
     if setup.emit == 0u {
         pair_counts[rank] = found;
+    } else {
+        pair_counts[view.capacity + 2u * gaussian] = slot;
+        pair_counts[view.capacity + 2u * gaussian + 1u] = slot + found;
     }
 }
 

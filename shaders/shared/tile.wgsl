@@ -1,55 +1,69 @@
-// A tile's Gaussians and pixels, as the blending passes see them. A workgroup covers a tile: each invocation takes QUADS quads of 2×2
-// pixels, a quad held as the lanes of a vec4, and the Gaussians pass in batches through workgroup memory.
+// Tiles' Gaussians and pixels, as the blending passes see them. A workgroup covers GROUP_TILES tiles, each with TILE_THREADS invocations; an
+// invocation takes a block of STRIPS strips of 4×1 pixels below one another, a strip held as the lanes of a vec4, and the Gaussians pass in batches
+// through workgroup memory.
 
 @group(0) @binding(0) var<uniform> view: View;
 // [tiles] (first pair, past the last) in the sorted list; [pairs] slot of each sorted pair; [pairs] Gaussian of each slot.
 @group(0) @binding(1) var<storage, read> ranges: array<vec2<u32>>;
 @group(0) @binding(2) var<storage, read> sorted_slots: array<u32>;
 @group(0) @binding(3) var<storage, read> slot_gaussians: array<u32>;
-// [3, capacity], see `project_forward`.
+// [N, 3], see `project_forward`.
 @group(0) @binding(4) var<storage, read> projected: array<vec4<f32>>;
 
-const TILE_QUADS: u32 = TILE_WIDTH * TILE_HEIGHT / 4u;
-const TILE_THREADS: u32 = TILE_QUADS / QUADS;
-// Gaussians held in workgroup memory at a time.
+const BLOCKS_ACROSS: u32 = TILE_WIDTH / 4u;
+const TILE_THREADS: u32 = BLOCKS_ACROSS * TILE_HEIGHT / STRIPS;
+const THREADS: u32 = TILE_THREADS * GROUP_TILES;
+// Gaussians of each tile held in workgroup memory at a time.
 const BATCH: u32 = 64u;
-var<workgroup> batch_mean: array<vec4<f32>, BATCH>;
-var<workgroup> batch_whitening: array<vec4<f32>, BATCH>;
-var<workgroup> batch_color: array<vec4<f32>, BATCH>;
+var<workgroup> batch_mean: array<vec4<f32>, BATCH * GROUP_TILES>;
+var<workgroup> batch_whitening: array<vec4<f32>, BATCH * GROUP_TILES>;
+var<workgroup> batch_color: array<vec4<f32>, BATCH * GROUP_TILES>;
 
-struct Quad {
+// An invocation's place: its tile's number in the workgroup, its own in the tile, and the tile's pairs in the sorted list, none where the grid
+// has ended.
+struct Place {
+    member: u32,
+    thread: u32,
+    range: vec2<u32>,
+    block: Block,
+}
+
+struct Block {
+    // Columns of all strips, and the first strip's row.
     x: vec4<f32>,
-    y: vec4<f32>,
-    // 1 where the pixel is on the image.
-    inside: vec4<bool>,
-    // Row-major pixel indices.
-    index: vec4<u32>,
+    y: f32,
+    // What is on the image: of the columns, and the number of rows.
+    columns: vec4<bool>,
+    rows: u32,
+    // Row-major pixel index of the corner.
+    first: u32,
 }
 
-// Quad number `quad` of the tile's TILE_QUADS: four make a block of 4×4 pixels, and the blocks follow in rows.
-fn quad_of(view_: View, tile: u32, quad: u32) -> Quad {
-    let first = vec2((tile % view_.tiles_x) * TILE_WIDTH, (tile / view_.tiles_x) * TILE_HEIGHT);
-    let block = vec2(quad / 4u % (TILE_WIDTH / 4u), quad / TILE_WIDTH);
-    let corner = first + 4u * block + 2u * vec2(quad % 2u, quad / 2u % 2u);
-    let x = vec4(corner.x, corner.x + 1u, corner.x, corner.x + 1u);
-    let y = vec4(corner.y, corner.y, corner.y + 1u, corner.y + 1u);
-    let inside = (x < vec4(view_.width)) & (y < vec4(view_.height));
-    return Quad(vec4<f32>(x), vec4<f32>(y), inside, y * view_.width + x);
+fn place_of(group: u32, local: u32) -> Place {
+    let member = local / TILE_THREADS;
+    let thread = local % TILE_THREADS;
+    let tile = group * GROUP_TILES + member;
+    let tiles = view.tiles_x * view.tiles_y;
+    let range = select(vec2(0u), ranges[min(tile, tiles - 1u)], tile < tiles);
+    return Place(member, thread, range, block_of(tile, thread));
 }
 
-// ½dᵀΣ⁻¹d of a Gaussian at the quad's pixels: alpha is opacity·exp(-that).
-fn half_distance(mean: vec2<f32>, whitening: vec3<f32>, quad: Quad) -> vec4<f32> {
-    let dy = quad.y - mean.y;
-    let u = whitening.x * (quad.x - mean.x) + whitening.y * dy;
-    let v = whitening.z * dy;
-    return u * u + v * v;
+// The blocks follow in rows. Beyond the grid a block has no rows.
+fn block_of(tile: u32, thread: u32) -> Block {
+    let x = (tile % view.tiles_x) * TILE_WIDTH + thread % BLOCKS_ACROSS * 4u;
+    let y = (tile / view.tiles_x) * TILE_HEIGHT + thread / BLOCKS_ACROSS * STRIPS;
+    let columns = vec4(x) + vec4(0u, 1u, 2u, 3u);
+    let rows = view.height - min(y, view.height);
+    return Block(vec4<f32>(columns), f32(y), columns < vec4(view.width), rows, y * view.width + x);
 }
 
-fn load_batch(start: u32, end: u32, local: u32) {
-    for (var k = local; k < min(BATCH, end - start); k += TILE_THREADS) {
-        let gaussian = slot_gaussians[sorted_slots[start + k]];
-        batch_mean[k] = projected[gaussian];
-        batch_whitening[k] = projected[view.capacity + gaussian];
-        batch_color[k] = projected[2u * view.capacity + gaussian];
+// The members' tiles load up to BATCH of their Gaussians each, from the pair `start` of each one's list on, up to the pair `end`.
+fn load_batch(place: Place, start: u32, end: u32) {
+    let to = place.member * BATCH;
+    for (var k = place.thread; start + k < min(end, start + BATCH); k += TILE_THREADS) {
+        let gaussian = slot_gaussians[sorted_slots[place.range.x + start + k]];
+        batch_mean[to + k] = projected[3u * gaussian];
+        batch_whitening[to + k] = projected[3u * gaussian + 1u];
+        batch_color[to + k] = projected[3u * gaussian + 2u];
     }
 }

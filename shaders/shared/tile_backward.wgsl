@@ -11,9 +11,11 @@
 // [pairs, 3] see `PairGradient`.
 @group(0) @binding(8) var<storage, read_write> pair_gradients: array<vec4<f32>>;
 
-var<workgroup> tile_last: atomic<u32>;
+// How many Gaussians of each tile's list were blended, and the most of these.
+var<workgroup> tile_last: array<atomic<u32>, GROUP_TILES>;
+var<workgroup> longest: atomic<u32>;
 
-// A quad of pixels, in its lanes.
+// A strip of pixels, in its lanes.
 struct PixelState {
     transmittance: vec4<f32>,
     // Pixel value behind the current Gaussian, dotted with the gradient.
@@ -27,7 +29,7 @@ struct PixelState {
 
 // Gradient of a pair, q = ∂L/∂log α.
 struct PairGradient {
-    // (Σ w g_rgb, Σ w g_depth)
+    // (Σ w g_rgb, Σ w g_depth); without the channels that are clamped at black.
     color_depth: vec4<f32>,
     // (Σ q, Σ q dx, Σ q dy, 0)
     first: vec4<f32>,
@@ -35,14 +37,15 @@ struct PairGradient {
     second: vec4<f32>,
 }
 
-fn load_pixels(quad: Quad) -> PixelState {
+// A strip's pixels; counts them in `tile_last` and `longest`.
+fn load_pixels(place: Place, strip: u32) -> PixelState {
     var pixels: PixelState;
     pixels.transmittance = vec4(1.0);
-    for (var p = 0; p < 4; p++) {
-        if !quad.inside[p] {
+    for (var p = 0u; p < 4u; p++) {
+        if !place.block.columns[p] || strip >= place.block.rows {
             continue;
         }
-        let i = quad.index[p];
+        let i = place.block.first + strip * view.width + p;
         let gradient = image_gradients[i];
         let gradient_alpha = image_gradients[view.width * view.height + i].x;
         let final_state = state[i];
@@ -55,26 +58,33 @@ fn load_pixels(quad: Quad) -> PixelState {
         // Behind the first Gaussian lies everything blended, the background (it is in `rendered`) and, as alpha is 1 - T, its gradient.
         pixels.behind[p] = dot(rendered, gradient) - final_state.x * gradient_alpha;
     }
-    atomicMax(&tile_last, max(max(pixels.last.x, pixels.last.y), max(pixels.last.z, pixels.last.w)));
+    let last = max(max(pixels.last.x, pixels.last.y), max(pixels.last.z, pixels.last.w));
+    atomicMax(&tile_last[place.member], last);
+    atomicMax(&longest, last);
     return pixels;
 }
 
-// Takes a quad past one Gaussian, the one at `position` in the tile's list, and adds to its gradient.
+// What one Gaussian does to a strip, from its whitened distance (u, v).
+struct Passed {
+    weight: vec4<f32>,
+    // ∂L/∂log α.
+    q: vec4<f32>,
+    hit: vec4<bool>,
+}
+
+// Takes a strip past one Gaussian, the one at `position` in the tile's list.
 fn pass_gaussian(
+    u: vec4<f32>,
+    v: f32,
     mean: vec4<f32>,
-    shape: vec4<f32>,
+    opacity: f32,
     color: vec4<f32>,
     position: u32,
-    quad: Quad,
     pixels: ptr<function, PixelState>,
-    sum: ptr<function, PairGradient>,
-) {
-    let distance = half_distance(mean.xy, shape.xyz, quad);
+) -> Passed {
+    let distance = u * u + v * v;
     let hit = (distance <= vec4(mean.w)) & (vec4(position) < (*pixels).last);
-    if !any(hit) {
-        return;
-    }
-    let unbounded = shape.w * exp(-distance);
+    let unbounded = opacity * exp(-distance);
     let alpha = select(vec4(0.0), min(vec4(ALPHA_MAX), unbounded), hit);
     let value = (*pixels).red * color.x + (*pixels).green * color.y + (*pixels).blue * color.z + (*pixels).depth * mean.z;
     let weight = alpha * (*pixels).transmittance;
@@ -82,21 +92,38 @@ fn pass_gaussian(
     let gradient_alpha = (*pixels).transmittance * value - (*pixels).behind / (1.0 - alpha);
     (*pixels).transmittance *= 1.0 - alpha;
     // Above the cap alpha no longer depends on shape and opacity.
-    let q = select(vec4(0.0), gradient_alpha * alpha, hit & (unbounded <= vec4(ALPHA_MAX)));
-    let dx = quad.x - mean.x;
-    let dy = quad.y - mean.y;
-    let qx = q * dx;
-    let qy = q * dy;
-    let ones = vec4(1.0);
+    return Passed(weight, select(vec4(0.0), gradient_alpha * alpha, hit & (unbounded <= vec4(ALPHA_MAX))), hit);
+}
+
+// The same, and adds to its gradient; `dx`, `dy` lead from its mean to the strip's pixels.
+fn add_gradient(
+    dx: vec4<f32>,
+    dy: f32,
+    mean: vec4<f32>,
+    shape: vec4<f32>,
+    color: vec4<f32>,
+    position: u32,
+    pixels: ptr<function, PixelState>,
+    sum: ptr<function, PairGradient>,
+) {
+    let passed = pass_gaussian(shape.x * dx + shape.y * dy, shape.z * dy, mean, shape.w, color, position, pixels);
+    let weight = passed.weight;
+    let q = dot(passed.q, vec4(1.0));
+    let qx = dot(passed.q, dx);
     (*sum).color_depth +=
         vec4(dot(weight, (*pixels).red), dot(weight, (*pixels).green), dot(weight, (*pixels).blue), dot(weight, (*pixels).depth));
-    (*sum).first += vec4(dot(q, ones), dot(qx, ones), dot(qy, ones), 0.0);
-    (*sum).second += vec4(dot(qx, dx), dot(qx, dy), dot(qy, dy), 0.0);
+    (*sum).first += vec4(q, qx, q * dy, 0.0);
+    (*sum).second += vec4(dot(passed.q, dx * dx), qx * dy, q * dy * dy, 0.0);
+}
+
+// The gradient by a colour before its clamp at black.
+fn before_clamp(color: vec4<f32>, gradient: vec4<f32>) -> vec4<f32> {
+    return select(vec4(0.0), gradient, vec4(color.xyz > vec3(0.0), true));
 }
 
 // Pairs behind every pixel's last contributor were not blended.
-fn clear_unblended(first: u32, end: u32, local: u32) {
-    for (var i = first + local; i < end; i += TILE_THREADS) {
+fn clear_unblended(place: Place, blended: u32) {
+    for (var i = place.range.x + blended + place.thread; i < place.range.y; i += TILE_THREADS) {
         let slot = sorted_slots[i];
         pair_gradients[slot * 3u] = vec4(0.0);
         pair_gradients[slot * 3u + 1u] = vec4(0.0);

@@ -45,11 +45,10 @@ pub fn count_work(rasterizer: &mut Rasterizer, cloud: &GpuCloud, camera: &ViewCa
     let ranges: Vec<[u32; 2]> = ws.ranges.read(&gpu, 0, tiles as usize)?;
     let slots: Vec<u32> = ws.slots[sorted].read(&gpu, 0, counts.pairs as usize)?;
     let slot_gaussians: Vec<u32> = ws.slot_gaussians.read(&gpu, 0, counts.pairs as usize)?;
-    let means: Vec<[f32; 4]> = ws.projected.read(&gpu, 0, cloud.len())?;
-    let whitenings: Vec<[f32; 4]> = ws.projected.read(&gpu, cloud.capacity(), cloud.len())?;
+    let projected: Vec<[[f32; 4]; 3]> = ws.projected.read(&gpu, 0, cloud.len())?;
     let splat = |pair: u32| {
         let gaussian = slot_gaussians[slots[pair as usize] as usize] as usize;
-        (means[gaussian], whitenings[gaussian])
+        (projected[gaussian][0], projected[gaussian][1])
     };
     let per_tile: Vec<TileWork> = (0..tiles)
         .into_par_iter()

@@ -13,7 +13,7 @@ use super::kernels::Kernels;
 use super::scores::{GaussianScore, Scores, WrongPixels};
 use super::skip::{SkippedTiles, TileSkip};
 use super::{AdamConfig, LossConfig, LossTerms, TargetImage};
-use crate::gpu::{Gpu, GpuBuffer, GpuError, workgroups};
+use crate::gpu::{Gpu, GpuBuffer, GpuError};
 use crate::render::layout::{AdamSetup, COUNTERS, Counter, LossSetup, VISIBLE_COUNTER, View};
 use crate::render::{GpuCloud, PreparedView, Rasterizer, ViewCounts, cloud_from_planes};
 use crate::splat::{GaussianCloud, ViewCamera};
@@ -351,12 +351,12 @@ impl Optimiser {
             (7, &self.images[0].gradients),
             (8, &ws.pair_gradients),
         ];
-        k.rasterize_backward.dispatch(gpu, pass, &blend, workgroups(prepared.view.tiles()));
+        k.rasterize_backward.dispatch(gpu, pass, &blend, rasterizer.form().workgroups(prepared.view.tiles()));
         let mut project = vec![
             (0, rasterizer.view()),
             (1, &ws.counters),
-            (2, &ws.order[0]),
-            (3, &ws.pair_offsets),
+            (2, &ws.seen),
+            (3, &ws.pair_counts),
             (4, &ws.pair_gradients),
             (5, &self.pose_sums),
             (6, cloud.parameters()),

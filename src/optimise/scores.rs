@@ -1,7 +1,7 @@
 //! Scores of the Gaussians over some views, for density control: computed beside a training step, from its own tile lists and gradients.
 
 use super::LossConfig;
-use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, workgroups};
+use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel};
 use crate::render::layout::{Counter, ScoreSetup, VISIBLE_COUNTER};
 use crate::render::{GpuCloud, PreparedView, Rasterizer, shaders};
 
@@ -102,12 +102,12 @@ impl Scores {
             (9, &self.setup),
             (10, loss_total),
         ];
-        self.rasterize.dispatch(gpu, pass, &rasterize, workgroups(prepared.view.tiles()));
+        self.rasterize.dispatch(gpu, pass, &rasterize, rasterizer.form().workgroups(prepared.view.tiles()));
         let gather = [
             (0, rasterizer.view()),
             (1, &ws.counters),
-            (2, &ws.order[0]),
-            (3, &ws.pair_offsets),
+            (2, &ws.seen),
+            (3, &ws.pair_counts),
             (4, &ws.pair_gradients),
             (5, &ws.projected),
             (6, &self.scores),

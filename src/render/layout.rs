@@ -4,7 +4,7 @@ use bytemuck::{Pod, Zeroable};
 use nalgebra::Vector3;
 use serde::Serialize;
 
-use crate::gpu::Gpu;
+use crate::gpu::{Gpu, workgroups};
 use crate::splat::model::*;
 
 /// A tile is 16×8 pixels. On the software adapter 16×16 takes twice as long to blend: small Gaussians leave most of it untouched.
@@ -28,10 +28,11 @@ pub const GEOMETRY_PLANES: usize = 3;
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum BlendForm {
-    /// A 2×2 quad each, 32 invocations a tile; the backward pass keeps a Gaussian per invocation. For GPUs.
+    /// A strip of 4×1 pixels each, 32 invocations a tile; the backward pass keeps a Gaussian per invocation. For GPUs.
     #[default]
     Wide,
-    /// A 4×4 block each, 8 invocations a tile: every load from memory serves 16 pixels. For software adapters, where loads are what costs.
+    /// A block of 4×8 pixels each, four invocations a tile, two tiles a workgroup: every load from memory serves 32 pixels, and a Gaussian's gradient is summed
+    /// over four invocations only. For software adapters, where loads and stores are what costs.
     Narrow,
 }
 
@@ -43,12 +44,25 @@ impl BlendForm {
         if gpu.is_software() { Self::Narrow } else { Self::Wide }
     }
 
-    /// Quads of 2×2 pixels per invocation.
-    fn quads(self) -> u32 {
+    /// Strips of 4×1 pixels per invocation.
+    fn strips(self) -> u32 {
         match self {
             Self::Wide => 1,
-            Self::Narrow => 4,
+            Self::Narrow => 8,
         }
+    }
+
+    /// Tiles that a workgroup of a blending pass takes.
+    fn group_tiles(self) -> u32 {
+        match self {
+            Self::Wide => 1,
+            Self::Narrow => 2,
+        }
+    }
+
+    /// Workgroups of a blending pass over so many tiles.
+    pub fn workgroups(self, tiles: u32) -> [u32; 3] {
+        workgroups(tiles.div_ceil(self.group_tiles()))
     }
 }
 
@@ -67,7 +81,8 @@ pub fn wgsl_constants(form: BlendForm) -> String {
     let integers = [
         ("TILE_WIDTH", TILE_WIDTH),
         ("TILE_HEIGHT", TILE_HEIGHT),
-        ("QUADS", form.quads()),
+        ("STRIPS", form.strips()),
+        ("GROUP_TILES", form.group_tiles()),
         ("SCAN_BLOCK", SCAN_BLOCK),
         ("SORT_BLOCK", SORT_BLOCK),
         ("SORT_CHUNK", SORT_CHUNK),

@@ -179,8 +179,15 @@ impl Rasterizer {
         k.project_forward.dispatch(gpu, pass, &project, per_gaussian);
         let job = ScanJob { setup: &self.visible_scan, values: &ws.visible, prefix: &ws.prefix, bound: count };
         k.scan.encode(gpu, pass, ws, &job);
-        let compact =
-            [(0, uniform), (1, &ws.visible), (2, &ws.prefix), (3, &ws.projected), (4, &ws.depth_keys[0]), (5, &ws.order[0])];
+        let compact = [
+            (0, uniform),
+            (1, &ws.visible),
+            (2, &ws.prefix),
+            (3, &ws.projected),
+            (4, &ws.depth_keys[0]),
+            (5, &ws.order[0]),
+            (6, &ws.seen),
+        ];
         k.compact_visible.dispatch(gpu, pass, &compact, per_gaussian);
         k.sort.encode(gpu, pass, ws, (&ws.depth_keys, &ws.order), (VISIBLE_COUNTER, DEPTH_KEY_BITS));
         self.encode_tiles(pass, prepared);
@@ -193,7 +200,7 @@ impl Rasterizer {
             (5, &ws.color_depth),
             (6, &ws.state),
         ];
-        k.rasterize_forward.dispatch(gpu, pass, &bindings, workgroups(view.tiles()));
+        k.rasterize_forward.dispatch(gpu, pass, &bindings, self.form.workgroups(view.tiles()));
     }
 
     /// Tile lists: count, offsets, emit, stable sort by tile, ranges.

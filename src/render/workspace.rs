@@ -22,9 +22,12 @@ pub struct Workspace {
     pub(super) block_sums: GpuBuffer,
     pub(super) depth_keys: [GpuBuffer; 2],
     /// Visible Gaussians, nearest first, in `[0]` after the depth sort.
-    pub order: [GpuBuffer; 2],
-    pub(super) pair_counts: GpuBuffer,
-    pub pair_offsets: GpuBuffer,
+    pub(super) order: [GpuBuffer; 2],
+    /// Visible Gaussians in map order.
+    pub seen: GpuBuffer,
+    /// Per visible Gaussian its pairs, nearest first; then per Gaussian where its slots begin and end.
+    pub pair_counts: GpuBuffer,
+    pub(super) pair_offsets: GpuBuffer,
     // Per pair.
     pub(crate) pair_capacity: usize,
     pub(super) tile_keys: [GpuBuffer; 2],
@@ -64,6 +67,7 @@ impl Workspace {
             block_sums: empty("block sums")?,
             depth_keys: [empty("depth keys")?, empty("depth keys")?],
             order: [empty("order")?, empty("order")?],
+            seen: empty("seen")?,
             pair_counts: empty("pair counts")?,
             pair_offsets: empty("pair offsets")?,
             pair_capacity: 0,
@@ -106,7 +110,8 @@ impl Workspace {
         self.block_sums = GpuBuffer::storage(gpu, "block sums", (capacity as u64).div_ceil(u64::from(SCAN_BLOCK)) * 4)?;
         self.depth_keys = [words("depth keys")?, words("depth keys")?];
         self.order = [words("order")?, words("order")?];
-        self.pair_counts = words("pair counts")?;
+        self.seen = words("seen")?;
+        self.pair_counts = GpuBuffer::storage(gpu, "pair counts", capacity as u64 * 12)?;
         self.pair_offsets = words("pair offsets")?;
         self.capacity = capacity;
         self.reserve_histogram(gpu)
