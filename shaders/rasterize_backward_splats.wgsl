@@ -13,8 +13,7 @@ fn main(
     @builtin(num_workgroups) workgroups: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
 ) {
-    let tile = linear_workgroup(workgroup, workgroups);
-    let place = place_of(tile, local);
+    let place = place_of(linear_workgroup(workgroup, workgroups), local);
     strips[local] = load_pixels(place, 0u);
     workgroupBarrier();
     let count = workgroupUniformLoad(&longest);
@@ -40,7 +39,7 @@ fn main(
                 color = batch_color[local];
                 sum = PairGradient(vec4(0.0), vec4(0.0), vec4(0.0));
             }
-            let block = block_of(tile, turn);
+            let block = block_of(place.tile, turn);
             var pixels = strips[turn];
             add_gradient(block.x - mean.x, block.y - mean.y, mean, shape, color, position, &pixels, &sum);
             strips[turn].transmittance = pixels.transmittance;

@@ -3,7 +3,7 @@
 // through workgroup memory.
 
 @group(0) @binding(0) var<uniform> view: View;
-// [tiles] (first pair, past the last) in the sorted list; [pairs] slot of each sorted pair; [pairs] Gaussian of each slot.
+// [tiles] (first pair, past the last) in the sorted list, then [tiles] (tile, 0) in the order of `order_tiles`; [pairs] slot of each sorted pair; [pairs] Gaussian of each slot.
 @group(0) @binding(1) var<storage, read> ranges: array<vec2<u32>>;
 @group(0) @binding(2) var<storage, read> sorted_slots: array<u32>;
 @group(0) @binding(3) var<storage, read> slot_gaussians: array<u32>;
@@ -19,9 +19,10 @@ var<workgroup> batch_mean: array<vec4<f32>, BATCH * GROUP_TILES>;
 var<workgroup> batch_whitening: array<vec4<f32>, BATCH * GROUP_TILES>;
 var<workgroup> batch_color: array<vec4<f32>, BATCH * GROUP_TILES>;
 
-// An invocation's place: its tile's number in the workgroup, its own in the tile, and the tile's pairs in the sorted list, none where the grid
-// has ended.
+// An invocation's place: its tile, the tile's number in the workgroup, its own in the tile, and the tile's pairs in the sorted list. Beyond the last tile
+// there are no pairs and no pixels.
 struct Place {
+    tile: u32,
     member: u32,
     thread: u32,
     range: vec2<u32>,
@@ -42,13 +43,14 @@ struct Block {
 fn place_of(group: u32, local: u32) -> Place {
     let member = local / TILE_THREADS;
     let thread = local % TILE_THREADS;
-    let tile = group * GROUP_TILES + member;
     let tiles = view.tiles_x * view.tiles_y;
+    let turn = group * GROUP_TILES + member;
+    let tile = select(tiles, ranges[tiles + min(turn, tiles - 1u)].x, turn < tiles);
     let range = select(vec2(0u), ranges[min(tile, tiles - 1u)], tile < tiles);
-    return Place(member, thread, range, block_of(tile, thread));
+    return Place(tile, member, thread, range, block_of(tile, thread));
 }
 
-// The blocks follow in rows. Beyond the grid a block has no rows.
+// The blocks follow in rows. Below the image a block has no rows.
 fn block_of(tile: u32, thread: u32) -> Block {
     let x = (tile % view.tiles_x) * TILE_WIDTH + thread % BLOCKS_ACROSS * 4u;
     let y = (tile / view.tiles_x) * TILE_HEIGHT + thread / BLOCKS_ACROSS * STRIPS;

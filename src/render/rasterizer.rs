@@ -60,6 +60,7 @@ struct Kernels {
     compact_visible: Kernel,
     tile_lists: Kernel,
     tile_ranges: Kernel,
+    order_tiles: Kernel,
     rasterize_forward: Kernel,
     scan: Scan,
     sort: Sort,
@@ -103,6 +104,7 @@ impl Rasterizer {
             compact_visible: kernel(&shaders::COMPACT_VISIBLE),
             tile_lists: kernel(&shaders::TILE_LISTS),
             tile_ranges: kernel(&shaders::TILE_RANGES),
+            order_tiles: kernel(&shaders::ORDER_TILES),
             rasterize_forward: kernel(&shaders::RASTERIZE_FORWARD),
             scan: Scan::new(&gpu),
             sort: Sort::new(&gpu)?,
@@ -203,7 +205,7 @@ impl Rasterizer {
         k.rasterize_forward.dispatch(gpu, pass, &bindings, self.form.workgroups(view.tiles()));
     }
 
-    /// Tile lists: count, offsets, emit, stable sort by tile, ranges.
+    /// Tile lists: count, offsets, emit, stable sort by tile, ranges, order.
     fn encode_tiles(&self, pass: &mut wgpu::ComputePass<'_>, prepared: &PreparedView) {
         let (gpu, ws, k) = (&*self.gpu, &self.workspace, &self.kernels);
         let visible = (&ws.counters, Counter::per_element_offset(VISIBLE_COUNTER));
@@ -232,6 +234,7 @@ impl Rasterizer {
         debug_assert_eq!(sorted, prepared.sorted);
         let ranges = [(0, &ws.counters), (1, &ws.tile_keys[sorted]), (2, &ws.ranges)];
         k.tile_ranges.dispatch_indirect(gpu, pass, &ranges, (&ws.counters, Counter::per_element_offset(PAIR_COUNTER)));
+        k.order_tiles.dispatch(gpu, pass, &[(0, &self.view), (1, &ws.ranges)], [1, 1, 1]);
     }
 
     /// Reads the counters of the last view; when its pairs did not fit, grows the buffers and returns `None`: repeat the step.

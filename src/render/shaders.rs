@@ -47,6 +47,7 @@ shaders! {
     SORT = "sort", "sort", [VIEW, COUNTERS], ["count_digits", "scan_digits", "scatter"];
     TILE_LISTS = "tile_lists", "tile_lists", [VIEW, COUNTERS, SKIPPED_TILES], ["main"];
     TILE_RANGES = "tile_ranges", "tile_ranges", [VIEW, COUNTERS], ["main"];
+    ORDER_TILES = "order_tiles", "order_tiles", [VIEW], ["main"];
     RASTERIZE_FORWARD = "rasterize_forward", "rasterize_forward", [VIEW, TILE], ["main"];
     SELECT_TILES = "select_tiles", "select_tiles", [VIEW], ["main"];
     FILL_SKIPPED = "fill_skipped", "fill_skipped", [VIEW, SKIPPED_TILES], ["main"];

@@ -144,7 +144,7 @@ impl Workspace {
 
     pub(super) fn reserve_image(&mut self, gpu: &Gpu, (pixels, tiles): (u32, u32)) -> Result<(), GpuError> {
         if tiles > self.tiles {
-            self.ranges = GpuBuffer::storage(gpu, "ranges", u64::from(tiles) * 8)?;
+            self.ranges = GpuBuffer::storage(gpu, "ranges", u64::from(tiles) * 16)?;
             self.tiles = tiles;
         }
         if pixels > self.pixels {
