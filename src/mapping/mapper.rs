@@ -38,8 +38,8 @@ const BATCH: usize = 10;
 pub enum MappingError {
     #[error(transparent)]
     Gpu(#[from] GpuError),
-    #[error("keyframe {id} has no depth, and the map can only be seeded from depth")]
-    NoDepth { id: KeyframeId },
+    #[error("none of the keyframes has depth, neither measured nor of landmarks, and a map can only begin with depth")]
+    NoDepth,
     #[error("the loss of keyframe {id} is not finite; please report this with the recording's name and the configuration")]
     NotFinite { id: KeyframeId },
     #[error("keyframe {id} comes in another place or another size than before")]
@@ -95,10 +95,11 @@ impl Mapper {
         })
     }
 
-    /// Takes in a keyframe: seeds what the map lacks, optimises over the window, prunes. `stop` is asked between the steps.
+    /// Takes in a keyframe: seeds what the map lacks, optimises over the window, prunes. `stop` is asked between the steps. A keyframe without
+    /// depth is passed over until there is a map.
     pub fn insert(&mut self, keyframe: &Keyframe, stop: &dyn Fn() -> bool) -> Result<KeyframeReport, MappingError> {
-        if keyframe.image.depth.is_none() && self.keyframes.is_empty() && self.cloud.is_empty() {
-            return Err(MappingError::NoDepth { id: keyframe.id });
+        if keyframe.image.depth.is_none() && self.has_not_begun() {
+            return Ok(KeyframeReport { id: keyframe.id, ..KeyframeReport::default() });
         }
         let mut keyframe = self.sweep(keyframe).map_or(Cow::Borrowed(keyframe), Cow::Owned);
         let rendered = if self.cloud.is_empty() { None } else { Some(self.render(&keyframe.camera())?) };
@@ -173,6 +174,11 @@ impl Mapper {
     /// Duration of each step so far: its share of its batch.
     pub fn step_times(&self) -> &[Duration] {
         &self.step_times
+    }
+
+    /// Whether it has passed over all keyframes so far.
+    pub fn has_not_begun(&self) -> bool {
+        self.keyframes.is_empty() && self.cloud.is_empty()
     }
 
     pub fn gaussians(&self) -> usize {

@@ -11,7 +11,7 @@ use super::messages::guarded;
 use super::{KeyframeRecord, MapperMessage, PipelineError, Progress};
 use crate::evaluation::machine;
 use crate::gpu::Gpu;
-use crate::mapping::{KeyframeReport, Mapper, MappingConfig, RefinedPair, Refinement};
+use crate::mapping::{KeyframeReport, Mapper, MappingConfig, MappingError, RefinedPair, Refinement};
 use crate::splat::{GaussianCloud, MapSnapshot};
 
 /// What mapping came to, also when it ended early.
@@ -82,6 +82,9 @@ pub(super) fn map(
                 break;
             }
         }
+    }
+    if summary.error.is_none() && mapper.has_not_begun() && !summary.keyframes.is_empty() {
+        summary.error = Some(MappingError::NoDepth.into());
     }
     if summary.error.is_none() {
         let begun = (refinement, checkpoints.as_mut());

@@ -60,6 +60,11 @@ impl Mapper {
     /// Takes in the next keyframe of the state that the mapper was restored from, as it was then, and nothing else happens.
     pub fn insert_again(&mut self, keyframe: &Keyframe, state: &MapperState) -> Result<(), MappingError> {
         let not_the_same = || MappingError::NotTheSame { id: keyframe.id };
+        let is_next = state.keyframes.get(self.keyframes.len()).is_some_and(|then| then.id == keyframe.id);
+        if !is_next && self.keyframes.is_empty() && keyframe.image.depth.is_none() {
+            // Passed over then, too.
+            return Ok(());
+        }
         let then = state.keyframes.get(self.keyframes.len()).filter(|then| then.id == keyframe.id).ok_or_else(not_the_same)?;
         let with_half = self.config.learns_at_half_size();
         let mapped = MappedKeyframe::restore(&self.gpu, then, keyframe, with_half)?;

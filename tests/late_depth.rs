@@ -1,0 +1,53 @@
+//! A camera may see nothing near at first: the map begins with the first keyframe that has depth.
+
+use image::{Rgb, RgbImage};
+use keysplat::geometry::{Pinhole, Se3};
+use keysplat::gpu::Gpu;
+use keysplat::mapping::{DepthSource, Keyframe, KeyframeReport, Mapper, MapperState, MappingConfig};
+use keysplat::sequence::{DepthImage, RectifiedImage};
+
+const PINHOLE: Pinhole = Pinhole { fx: 60.0, fy: 60.0, cx: 31.5, cy: 23.5, width: 64, height: 48 };
+
+fn keyframe(id: usize, with_depth: bool) -> Keyframe {
+    let (width, height) = (PINHOLE.width, PINHOLE.height);
+    let color = RgbImage::from_fn(width, height, |x, y| Rgb([(x * 4) as u8, (y * 5) as u8, ((x / 6 + y / 6) % 2 * 200) as u8]));
+    let depth = with_depth.then(|| DepthImage { width, height, metres: vec![2.0; (width * height) as usize] });
+    let image = RectifiedImage { pinhole: PINHOLE, color, depth };
+    let world_from_camera = Se3::translation(0.01 * id as f64, 0.0, 0.0);
+    Keyframe { id, world_from_camera, image, depth_source: DepthSource::Sensor, covisible: Vec::new() }
+}
+
+#[test]
+fn keyframes_before_the_first_depth_are_passed_over() {
+    let gpu = match Gpu::open(None) {
+        Ok(gpu) => gpu,
+        Err(error) => {
+            eprintln!("SKIPPED, nothing was mapped: {error}");
+            return;
+        }
+    };
+    let config = MappingConfig { first_iterations: 5, iterations_per_keyframe: 5, ..Default::default() };
+    let mut mapper = Mapper::new(gpu.clone(), &config).unwrap();
+    for id in 0..2 {
+        let report = mapper.insert(&keyframe(id, false), &|| false).unwrap();
+        assert_eq!(report, KeyframeReport { id, ..Default::default() });
+        assert!(mapper.has_not_begun());
+    }
+    assert_eq!(mapper.update_poses(&[(0, Se3::identity())]).unwrap(), 0);
+    // A checkpoint of a map that has not begun, or just has, is gone on from.
+    let resume = |state: &MapperState, keyframes: &[Keyframe]| {
+        let mut resumed = Mapper::restore(gpu.clone(), &config, state).unwrap();
+        keyframes.iter().for_each(|keyframe| resumed.insert_again(keyframe, state).unwrap());
+        resumed
+    };
+    let resumed = resume(&mapper.state(None).unwrap(), &[keyframe(0, false), keyframe(1, false)]);
+    assert!(resumed.has_not_begun());
+    let begun = mapper.insert(&keyframe(2, true), &|| false).unwrap();
+    assert!(begun.seeded > 0 && begun.iterations == 5, "{begun:?}");
+    let mut resumed = resume(&mapper.state(None).unwrap(), &[keyframe(0, false), keyframe(1, false), keyframe(2, true)]);
+    resumed.insert(&keyframe(3, true), &|| false).unwrap();
+    mapper.insert(&keyframe(3, true), &|| false).unwrap();
+    assert_eq!(mapper.download().unwrap(), resumed.download().unwrap());
+    let after = mapper.insert(&keyframe(4, false), &|| false).unwrap();
+    assert!(after.seeded == 0 && after.iterations > 0 && after.gaussians > 0, "{after:?}");
+}
