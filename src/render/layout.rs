@@ -10,6 +10,8 @@ use crate::splat::model::*;
 /// A tile is 16×8 pixels. On the software adapter 16×16 takes twice as long to blend: small Gaussians leave most of it untouched.
 pub const TILE_WIDTH: u32 = 16;
 pub const TILE_HEIGHT: u32 = 8;
+/// Stripes of the list of tiles from which successive workgroups of the blending passes take in turn.
+pub const STRIPES: u32 = 16;
 /// Elements that one workgroup scans, and keys that one workgroup sorts.
 pub const SCAN_BLOCK: u32 = 2048;
 pub const SORT_BLOCK: u32 = 1024;
@@ -62,7 +64,7 @@ impl BlendForm {
 
     /// Workgroups of a blending pass over so many tiles.
     pub fn workgroups(self, tiles: u32) -> [u32; 3] {
-        workgroups(tiles.div_ceil(self.group_tiles()))
+        workgroups(tiles.div_ceil(self.group_tiles()).next_multiple_of(STRIPES))
     }
 }
 
@@ -83,6 +85,7 @@ pub fn wgsl_constants(form: BlendForm) -> String {
         ("TILE_HEIGHT", TILE_HEIGHT),
         ("STRIPS", form.strips()),
         ("GROUP_TILES", form.group_tiles()),
+        ("STRIPES", STRIPES),
         ("SCAN_BLOCK", SCAN_BLOCK),
         ("SORT_BLOCK", SORT_BLOCK),
         ("SORT_CHUNK", SORT_CHUNK),
