@@ -1,5 +1,5 @@
-// Lists the tiles that have Gaussians, then those that have none: a workgroup of the blending passes takes several, and one with nothing to do would idle
-// beside one that has. Neighbours stay together, for they share Gaussians. One workgroup.
+// Lists the tiles that have Gaussians, then those that have none: a workgroup of the blending passes takes several, and one with nothing
+// to do would idle beside one that has. Neighbours stay together, for they share Gaussians. One workgroup.
 
 @group(0) @binding(0) var<uniform> view: View;
 // [tiles] ranges of pairs; behind them [tiles] (tile, 0).

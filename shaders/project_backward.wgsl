@@ -1,8 +1,8 @@
 // Carries the pairs' gradients through the projection to each visible Gaussian's parameters, and to the camera pose.
 //
-// One invocation a visible Gaussian, in map order: neighbours' parameters lie side by side. A Gaussian's pairs do as well, and are summed in order. `begin_gradient` and `store_gradient` are the sink: it steps Adam at
-// once (`shared/sink_adam.wgsl`) or writes the gradient down (`shared/sink_gradient.wgsl`). The pose gradient is that of the left
-// perturbation T ← Exp(τ)·T of camera_from_world, τ = (ρ, θ).
+// One invocation a visible Gaussian, in map order: neighbours' parameters lie side by side. A Gaussian's pairs do as well, and are summed
+// in order. `begin_gradient` and `store_gradient` are the sink: it steps Adam at once (`shared/sink_adam.wgsl`) or writes the gradient
+// down (`shared/sink_gradient.wgsl`). The pose gradient is that of the left perturbation T ← Exp(τ)·T of camera_from_world, τ = (ρ, θ).
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<storage, read> counters: array<Counter>;

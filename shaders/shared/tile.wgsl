@@ -45,9 +45,9 @@ fn place_of(group: u32, local: u32) -> Place {
     let thread = local % TILE_THREADS;
     let tiles = view.tiles_x * view.tiles_y;
     // Successive workgroups go to one thread of a software adapter: each stretch of them takes from the whole list, whose end has nothing to do.
-    let stripe = (tiles + GROUP_TILES * STRIPES - 1u) / (GROUP_TILES * STRIPES);
-    let turn = (group % STRIPES * stripe + group / STRIPES) * GROUP_TILES + member;
-    let is_there = turn < tiles && group / STRIPES < stripe;
+    let part = (tiles + GROUP_TILES * LIST_PARTS - 1u) / (GROUP_TILES * LIST_PARTS);
+    let turn = (group % LIST_PARTS * part + group / LIST_PARTS) * GROUP_TILES + member;
+    let is_there = turn < tiles && group / LIST_PARTS < part;
     let tile = select(tiles, ranges[tiles + min(turn, tiles - 1u)].x, is_there);
     let range = select(vec2(0u), ranges[min(tile, tiles - 1u)], tile < tiles);
     return Place(tile, member, thread, range, block_of(tile, thread));

@@ -10,8 +10,8 @@ use crate::splat::model::*;
 /// A tile is 16×8 pixels. On the software adapter 16×16 takes twice as long to blend: small Gaussians leave most of it untouched.
 pub const TILE_WIDTH: u32 = 16;
 pub const TILE_HEIGHT: u32 = 8;
-/// Stripes of the list of tiles from which successive workgroups of the blending passes take in turn.
-pub const STRIPES: u32 = 16;
+/// Parts of the list of tiles from which successive workgroups of the blending passes take in turn.
+pub const LIST_PARTS: u32 = 16;
 /// Elements that one workgroup scans, and keys that one workgroup sorts.
 pub const SCAN_BLOCK: u32 = 2048;
 pub const SORT_BLOCK: u32 = 1024;
@@ -64,7 +64,7 @@ impl BlendForm {
 
     /// Workgroups of a blending pass over so many tiles.
     pub fn workgroups(self, tiles: u32) -> [u32; 3] {
-        workgroups(tiles.div_ceil(self.group_tiles()).next_multiple_of(STRIPES))
+        workgroups(tiles.div_ceil(self.group_tiles()).next_multiple_of(LIST_PARTS))
     }
 }
 
@@ -85,7 +85,7 @@ pub fn wgsl_constants(form: BlendForm) -> String {
         ("TILE_HEIGHT", TILE_HEIGHT),
         ("STRIPS", form.strips()),
         ("GROUP_TILES", form.group_tiles()),
-        ("STRIPES", STRIPES),
+        ("LIST_PARTS", LIST_PARTS),
         ("SCAN_BLOCK", SCAN_BLOCK),
         ("SORT_BLOCK", SORT_BLOCK),
         ("SORT_CHUNK", SORT_CHUNK),
