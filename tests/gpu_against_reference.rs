@@ -264,6 +264,29 @@ fn non_finite_gaussians_are_refused_or_culled() {
 }
 
 #[test]
+fn depth_that_is_trusted_by_a_quarter_counts_as_if_it_had_a_quarter_of_the_weight() {
+    let Some(gpu) = gpu() else { return };
+    let mut rng = Rng::with_seed(9);
+    let camera = common::camera(&mut rng, 64, 48);
+    let cloud = common::scene(&mut rng, 200, ShDegree::default());
+    let (image, wide) = target(&mut rng, camera.pinhole);
+    let image = upload_target(&gpu, &image, &wide);
+    let learn = |depth_trust: f32, depth_weight: f32| {
+        let mut rasterizer = Rasterizer::new(gpu.clone()).unwrap();
+        let on_gpu = upload(&gpu, &cloud);
+        let views = [TrainingView { depth_trust, ..TrainingView::new(camera, &image) }; 5];
+        let loss = LossConfig { depth_weight, ..LossConfig::default() };
+        let configs = (&loss, &AdamConfig::default());
+        let reports = Optimiser::new(&rasterizer).unwrap().steps(&mut rasterizer, &on_gpu, &views, configs).unwrap();
+        (on_gpu.download(&gpu).unwrap(), reports[4].loss.total(&loss))
+    };
+    let (trusted, weighted, whole) = (learn(0.25, 0.8), learn(1.0, 0.2), learn(1.0, 0.8));
+    // A power of two: to the bit.
+    assert_eq!(trusted, weighted);
+    assert_ne!(trusted.0, whole.0, "the weight does nothing here");
+}
+
+#[test]
 fn pairs_that_outgrow_their_buffers_are_never_dropped() {
     let Some(gpu) = gpu() else { return };
     let mut rng = Rng::with_seed(5);

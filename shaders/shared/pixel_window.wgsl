@@ -81,10 +81,12 @@ struct LossSetup {
     depth_weight: f32,
     // Depth, metres, beyond which the weight falls with its square, as a sensor's precision does.
     precise_depth: f32,
+    // Of the view's depth image, 0 to 1.
+    depth_trust: f32,
 }
 
-// What a measured depth's residual counts, as a share of `depth_weight`.
+// What a residual of depth counts, as a share of `depth_weight`.
 fn depth_precision(measured: f32) -> f32 {
     let ratio = setup.precise_depth / measured;
-    return min(1.0, ratio * ratio);
+    return setup.depth_trust * min(1.0, ratio * ratio);
 }

@@ -231,6 +231,11 @@ impl MappedKeyframe {
         self.gray = None;
     }
 
+    /// Whether its depth, if any, was estimated and not measured.
+    pub fn depth_is_estimated(&self) -> bool {
+        self.gray.is_some()
+    }
+
     /// What depth is swept for with.
     pub fn source(&self) -> Option<SourceView<'_>> {
         self.gray.as_ref().map(|gray| SourceView { camera: self.camera, gray })

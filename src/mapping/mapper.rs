@@ -340,8 +340,10 @@ impl Mapper {
         // A pose is refined by its whole image.
         let skip = self.config.skip.tiles().filter(|_| !self.config.refine_poses.enabled);
         let view = |step: &Step| {
-            let view = self.keyframes[step.keyframe].view(step.coarse).expect("only keyframes with images are drawn");
-            TrainingView { pace: step.pace, scored, skip, ..view }
+            let keyframe = &self.keyframes[step.keyframe];
+            let view = keyframe.view(step.coarse).expect("only keyframes with images are drawn");
+            let depth_trust = if keyframe.depth_is_estimated() { self.config.plane_sweep.trust } else { 1.0 };
+            TrainingView { pace: step.pace, depth_trust, scored, skip, ..view }
         };
         let views: Vec<TrainingView<'_>> = batch.iter().map(view).collect();
         let started = Instant::now();

@@ -20,7 +20,7 @@ pub struct LossConfig {
 
 impl Default for LossConfig {
     fn default() -> Self {
-        Self { ssim_weight: 0.2, depth_weight: 0.2, precise_depth_metres: 4.0 }
+        Self { ssim_weight: 0.2, depth_weight: 0.4, precise_depth_metres: 4.0 }
     }
 }
 

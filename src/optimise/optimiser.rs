@@ -36,6 +36,8 @@ pub struct TrainingView<'a> {
     pub scored: Option<WrongPixels>,
     /// Share of Adam's step sizes that the step takes.
     pub pace: f32,
+    /// Share of its weight in the loss that the target's depth deserves: 1 if a sensor measured it.
+    pub depth_trust: f32,
     /// Which tiles are left out; a scored step leaves none.
     pub skip: Option<TileSkip>,
 }
@@ -43,7 +45,7 @@ pub struct TrainingView<'a> {
 impl<'a> TrainingView<'a> {
     /// The whole view at full pace, not scored.
     pub fn new(camera: ViewCamera, target: &'a TargetImage) -> Self {
-        Self { camera, target, scored: None, pace: 1.0, skip: None }
+        Self { camera, target, scored: None, pace: 1.0, depth_trust: 1.0, skip: None }
     }
 }
 
@@ -68,8 +70,8 @@ pub struct Gradients {
 
 /// Where the backward pass starts from.
 enum Objective<'a> {
-    /// With the Gaussians' scores on the way, if asked for, and the tiles to leave out with the seed of the draw.
-    Image { target: &'a TargetImage, loss: &'a LossConfig, scored: Option<&'a WrongPixels>, skip: Option<(TileSkip, u32)> },
+    /// With the trust in the target's depth, the Gaussians' scores on the way, if asked for, and the tiles to leave out with the draw's seed.
+    Image { target: &'a TargetImage, loss: (&'a LossConfig, f32), scored: Option<&'a WrongPixels>, skip: Option<(TileSkip, u32)> },
     /// Gradients by the image are in the buffer already.
     Given,
 }
@@ -141,9 +143,9 @@ impl Optimiser {
         let mut pending: Vec<usize> = (0..views.len()).collect();
         while !pending.is_empty() {
             for (entry, &i) in pending.iter().enumerate() {
-                let TrainingView { camera, target, scored, pace, skip } = &views[i];
+                let TrainingView { camera, target, scored, pace, depth_trust, skip } = &views[i];
                 let skip = skip.filter(|_| scored.is_none()).map(|skip| (skip, self.steps as u32));
-                let objective = Objective::Image { target, loss, scored: scored.as_ref(), skip };
+                let objective = Objective::Image { target, loss: (loss, *depth_trust), scored: scored.as_ref(), skip };
                 let started = Instant::now();
                 self.adam.write(&gpu, 0, &[adam.setup(self.steps, *pace)]);
                 self.steps += 1;
@@ -209,7 +211,7 @@ impl Optimiser {
         loss: &LossConfig,
     ) -> Result<Gradients, GpuError> {
         let gpu = rasterizer.gpu().clone();
-        let objective = Objective::Image { target, loss, scored: None, skip: None };
+        let objective = Objective::Image { target, loss: (loss, 1.0), scored: None, skip: None };
         let mut gradients = self.collect(rasterizer, cloud, camera, [0.0; 3], &objective)?;
         gradients.loss = self.read_loss(&gpu, target)?;
         Ok(gradients)
@@ -293,14 +295,15 @@ impl Optimiser {
             encoder.clear_buffer(buffer.raw(), 0, None);
         }
         let mut pass = encoder.begin_compute_pass(&Default::default());
-        if let Objective::Image { loss, skip: Some(skip), .. } = objective {
+        if let Objective::Image { loss: (loss, _), skip: Some(skip), .. } = objective {
             self.skipped.encode_select(&mut pass, rasterizer, &self.images[0], loss, skip);
         }
         rasterizer.encode_forward(&mut pass, cloud, &prepared);
         if let Objective::Image { loss, scored, skip, .. } = objective {
-            self.encode_loss(&mut pass, rasterizer, loss, skip.is_some());
+            skip.iter().for_each(|_| self.skipped.encode_fill(&mut pass, rasterizer, &self.images[0]));
+            self.encode_loss(&mut pass, rasterizer, *loss);
             let image = (&self.images[0].gradients, &self.loss_total);
-            scored.iter().for_each(|wrong| self.scores.encode(&mut pass, rasterizer, &prepared, image, (wrong, loss)));
+            scored.iter().for_each(|wrong| self.scores.encode(&mut pass, rasterizer, &prepared, image, (wrong, loss.0)));
         }
         self.encode_backward(&mut pass, rasterizer, cloud, &prepared, sink);
         gpu.mark(&mut pass, Self::END_MARK);
@@ -311,15 +314,12 @@ impl Optimiser {
         Ok(())
     }
 
-    fn encode_loss(&self, pass: &mut wgpu::ComputePass<'_>, rasterizer: &Rasterizer, loss: &LossConfig, skips: bool) {
+    fn encode_loss(&self, pass: &mut wgpu::ComputePass<'_>, rasterizer: &Rasterizer, (loss, depth_trust): (&LossConfig, f32)) {
         let (gpu, ws, k) = (rasterizer.gpu(), &rasterizer.workspace, &self.kernels);
         let TargetImage { width, height, color, depth, .. } = &self.images[0].target;
         let (width, height) = (*width, *height);
-        if skips {
-            self.skipped.encode_fill(pass, rasterizer, &self.images[0]);
-        }
         let LossConfig { ssim_weight, depth_weight, precise_depth_metres: precise_depth } = *loss;
-        let setup = LossSetup { width, height, ssim_weight, depth_weight, precise_depth };
+        let setup = LossSetup { width, height, ssim_weight, depth_weight, precise_depth, depth_trust };
         self.loss_setup.write(gpu, 0, &[setup]);
         let forward = [width.div_ceil(LOSS_TILE), height.div_ceil(LOSS_TILE / 2), 1];
         let backward = [width.div_ceil(LOSS_TILE), height.div_ceil(LOSS_TILE), 1];

@@ -227,6 +227,7 @@ host_twins! {
         ssim_weight: f32,
         depth_weight: f32,
         precise_depth: f32,
+        depth_trust: f32,
     }
     /// What counts as a wrong pixel (`shaders/rasterize_scores.wgsl`).
     ScoreSetup {

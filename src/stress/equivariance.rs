@@ -87,7 +87,7 @@ struct Run {
 
 fn run(machine: &Machine, scene: &Scene, target: &TargetImage, loss: &LossConfig) -> Result<Run, GpuError> {
     let on_gpu = machine.upload(&scene.cloud)?;
-    let view = TrainingView { camera: scene.camera, target, scored: None, pace: 1.0, skip: None };
+    let view = TrainingView::new(scene.camera, target);
     machine.with(1, |rasterizer, optimiser| {
         let gradient = optimiser.gradients(rasterizer, &on_gpu, &scene.camera, target, loss)?.cloud;
         let reports = optimiser.steps(rasterizer, &on_gpu, &[view; STEPS], (loss, &AdamConfig::default()))?;

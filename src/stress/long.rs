@@ -65,8 +65,7 @@ fn long(machine: &Machine, rng: &mut Rng, steps: usize) -> Result<Outcome, GpuEr
         start.sh[i * 4] += jitter(0.5);
     }
     let on_gpu = machine.upload(&start)?;
-    let view =
-        |k: usize| TrainingView { camera: cameras[k % VIEWS], target: &targets[k % VIEWS], scored: None, pace: 1.0, skip: None };
+    let view = |k: usize| TrainingView::new(cameras[k % VIEWS], &targets[k % VIEWS]);
     let batch: Vec<TrainingView<'_>> = (0..BATCH).map(view).collect();
     let (loss, adam) = (LossConfig::default(), AdamConfig::default());
     let mut losses = Vec::new();

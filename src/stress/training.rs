@@ -49,7 +49,7 @@ fn train(machine: &Machine, rng: &mut Rng, scene: &Scene, fault: Fault) -> Resul
     let (loss, adam) = (LossConfig::default(), AdamConfig::default());
     let on_gpu = machine.upload(&scene.cloud)?;
     let skip = rng.bool().then_some(TileSkip { share: 0.5, least: 0.1, noise: 0.0 });
-    let view = TrainingView { camera: scene.camera, target: &target, scored: None, pace: 1.0, skip };
+    let view = TrainingView { skip, ..TrainingView::new(scene.camera, &target) };
     let whole = TrainingView { skip: None, ..view };
     machine.with(rng.usize(..2), |rasterizer, optimiser| {
         let mut outcome = Outcome::default();
