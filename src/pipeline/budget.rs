@@ -47,7 +47,7 @@ impl Budget {
             ],
             Self::Balanced => &[],
             Self::Quality => {
-                &["mapping.iterations_per_keyframe=50", "mapping.seeding.detail=0.04", "mapping.density.vcd.min_worth=0.5"]
+                &["mapping.iterations_per_keyframe=40", "mapping.seeding.detail=0.04", "mapping.density.vcd.min_worth=0.5"]
             }
         }
     }
