@@ -2,13 +2,14 @@
 //!
 //! A homography and a fundamental matrix are both fitted and scored (Mur-Artal, Montiel & Tardós, *ORB-SLAM*, 2015, sec. IV): a plane
 //! or little parallax is explained by the first, anything else by the second. Every motion that the better one allows is tried by
-//! triangulating all matches, and taken only if it is clearly the best and shows enough parallax.
+//! triangulating all matches; the best is refined by all its inliers, and taken only if it is clearly the best and shows enough parallax.
 
 use nalgebra::{Isometry3, Matrix3, Point3, Rotation3, Translation3, UnitQuaternion, Vector2, Vector3};
 use opencv::calib3d;
 use opencv::core::{Mat, MatTraitConst, MatTraitConstManual, Point2d, Vector};
 
 use super::TrackingError;
+use super::epipolar;
 use super::triangulate::{View, triangulate};
 use crate::geometry::{Pinhole, Se3};
 
@@ -28,6 +29,8 @@ const CLEARLY: f64 = 0.75;
 /// Parallax that at least `MIN_POINTS` points must have, as pixels at the image's centre: well above what keypoints are off, or a turn
 /// passes for a translation.
 const MIN_PARALLAX_PIXELS: f64 = 17.0;
+/// Times that the best motion is refined by its inliers, each time those that it then has.
+const REFINEMENTS: usize = 2;
 /// Reprojection error of a good point, pixels.
 const MAX_ERROR_PIXELS: f64 = 2.0;
 
@@ -49,9 +52,16 @@ pub fn two_views(matches: &[(Vector2<f64>, Vector2<f64>)], pinhole: &Pinhole) ->
     let mut tried: Vec<(usize, f64, TwoViews)> =
         candidates.motions.iter().map(|motion| try_motion(motion, matches, &candidates.inliers, pinhole)).collect();
     tried.sort_by_key(|(count, ..)| std::cmp::Reverse(*count));
-    let inliers = candidates.inliers.iter().filter(|i| **i).count();
     let second = tried.get(1).map_or(0, |(count, ..)| *count);
-    let (count, parallax_rad, best) = tried.into_iter().next()?;
+    let (_, _, best) = tried.into_iter().next()?;
+    let (mut pose, mut inliers) = (best.second_from_first, candidates.inliers);
+    for _ in 0..REFINEMENTS {
+        let kept = matches.iter().zip(&inliers).filter(|(_, is_inlier)| **is_inlier).map(|(pixels, _)| pixels);
+        pose = epipolar::refine(&pose, kept, pinhole);
+        inliers = score_fundamental(&epipolar::fundamental(&pose, pinhole), matches).1;
+    }
+    let (count, parallax_rad, best) = try_motion(&pose, matches, &inliers, pinhole);
+    let inliers = inliers.iter().filter(|i| **i).count();
     let enough = count >= MIN_POINTS && count as f64 >= MIN_POINT_SHARE * inliers as f64;
     let clear = (second as f64) < CLEARLY * count as f64;
     (enough && clear && parallax_rad * pinhole.fx >= MIN_PARALLAX_PIXELS).then_some(best)
@@ -81,9 +91,7 @@ fn motions(matches: &[(Vector2<f64>, Vector2<f64>)], pinhole: &Pinhole) -> Resul
         RANSAC_ITERATIONS,
         &mut mask,
     )?;
-    let inverse = camera.try_inverse().unwrap_or_default();
-    let essential_matrix = to_matrix(&essential);
-    let fundamental_score = essential_matrix.map(|e| score_fundamental(&(inverse.transpose() * e * inverse), matches));
+    let fundamental_score = to_matrix(&essential).map(|e| score_fundamental(&epipolar::fundamental_of(&e, pinhole), matches));
     match (homography_score, fundamental_score) {
         (Some((h, inliers)), Some((f, _))) if h > HOMOGRAPHY_SHARE * (h + f) => {
             Ok(Candidates { motions: of_homography(&homography, &k)?, inliers })

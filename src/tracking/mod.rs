@@ -12,6 +12,7 @@ mod config;
 mod culling;
 mod dense;
 mod descriptor;
+mod epipolar;
 mod error;
 mod features;
 mod frame_features;
