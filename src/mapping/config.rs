@@ -215,7 +215,10 @@ impl MappingConfig {
         let refine = RefineConfig { steps: 6000, ..RefineConfig::default() };
         // Points and seeds lie further from where they belong than those of a depth image do.
         let adam = AdamConfig { position_rate: 0.16, ..AdamConfig::default() };
-        Self { iterations_per_keyframe: 0, first_iterations: 0, refine, adam, ..Self::default() }
+        // They begin with few Gaussians, and none come with later keyframes: the map must grow by itself.
+        let mut density = DensityConfig::default();
+        density.vcd.max_growth = 0.15;
+        Self { iterations_per_keyframe: 0, first_iterations: 0, refine, adam, density, ..Self::default() }
     }
 
     /// The same for a world whose unit is not the metre but `units_per_metre` to one: each length is given in that unit.
