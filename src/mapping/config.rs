@@ -215,7 +215,7 @@ impl MappingConfig {
         let refine = RefineConfig { steps: 6000, ..RefineConfig::default() };
         // Points and seeds lie further from where they belong than those of a depth image do.
         let adam = AdamConfig { position_rate: 0.16, ..AdamConfig::default() };
-        // They begin with few Gaussians, and none come with later keyframes: the map must grow by itself.
+        // No keyframe seeds anything during the refinement: what the first Gaussians miss must grow out of them.
         let mut density = DensityConfig::default();
         density.vcd.max_growth = 0.15;
         Self { iterations_per_keyframe: 0, first_iterations: 0, refine, adam, density, ..Self::default() }

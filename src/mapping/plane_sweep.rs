@@ -29,7 +29,7 @@ pub struct PlaneSweepConfig {
     pub uniqueness: f32,
     /// Share of the landmarks that must be met, for anything to be believed.
     pub min_agreement: f64,
-    /// What such depth counts in the loss, as a share of what measured depth counts (`mapping.loss.depth_weight`).
+    /// What such depth, and that of landmarks alone, counts in the loss: as a share of measured depth (`mapping.loss.depth_weight`).
     pub trust: f32,
 }
 

@@ -92,17 +92,17 @@ fn train(machine: &Machine, rng: &mut Rng, scene: &Scene, fault: Fault) -> Resul
 
 /// Whether a Gaussian has a gradient at all, but none that overflowed.
 fn is_seen(gradients: &GaussianCloud, i: usize) -> bool {
-    numbers(gradients, i).any(|v| v.abs() > 1e-20 && v.abs() < OVERFLOW)
+    components(gradients, i).any(|v| v.abs() > 1e-20 && v.abs() < OVERFLOW)
 }
 
 /// Whether a Gaussian has a gradient that Adam follows: one far below what it was is lost in the memory of that, as it should be.
 fn is_pulled(now: &GaussianCloud, at_first: &GaussianCloud, i: usize) -> bool {
-    let grows_or_stays = numbers(now, i).zip(numbers(at_first, i)).any(|(now, then)| now.abs() > FORGOTTEN * then.abs());
+    let grows_or_stays = components(now, i).zip(components(at_first, i)).any(|(now, then)| now.abs() > FORGOTTEN * then.abs());
     grows_or_stays && is_seen(now, i)
 }
 
 /// Gradients by mean, log scale, opacity and constant colour.
-fn numbers(gradients: &GaussianCloud, i: usize) -> impl Iterator<Item = f32> {
+fn components(gradients: &GaussianCloud, i: usize) -> impl Iterator<Item = f32> {
     let g = gradients.get(i);
     let geometry = g.mean.to_array().into_iter().chain(g.log_scale.to_array()).chain([g.raw_opacity]);
     geometry.chain(g.sh[0].to_array())

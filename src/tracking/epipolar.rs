@@ -1,10 +1,11 @@
 //! The relative pose of two views by least squares on their matches' distances from the epipolar lines.
 //!
-//! What RANSAC finds fits five matches exactly and all others by chance: twenty standard deviations off and more. Here all inliers have
+//! What RANSAC finds fits five matches exactly and all others by chance: nine standard deviations off in the median (`docs/stress.md`). Here all inliers have
 //! their say (Hartley & Zisserman, *Multiple View Geometry*, 2nd ed., sec. 11.4.3: Sampson's distance; Levenberg-Marquardt, Huber weights).
 
 use nalgebra::{Matrix2x3, Matrix3, Matrix5, Translation3, UnitQuaternion, Vector2, Vector3, Vector5};
 
+use super::measurement::huber;
 use crate::geometry::se3::skew;
 use crate::geometry::{Pinhole, Se3};
 
@@ -39,11 +40,11 @@ pub fn refine<'a>(
     for _ in 0..MAX_ROUNDS {
         let damped = system.hessian + Matrix5::from_diagonal(&system.hessian.diagonal()) * damping;
         let Some(step) = damped.cholesky().map(|factors| -factors.solve(&system.gradient)) else { break };
-        let moved = moved(&pose, &step);
-        let next = System::new(&moved, matches.clone(), pinhole);
+        let candidate = moved(&pose, &step);
+        let next = System::new(&candidate, matches.clone(), pinhole);
         // NaN is no gain.
         if next.cost < system.cost {
-            (pose, system, damping) = (moved, next, damping * 0.1);
+            (pose, system, damping) = (candidate, next, damping * 0.1);
         } else {
             damping *= 10.0;
         }
@@ -100,10 +101,10 @@ impl System {
                 let length_by = (line_b.dot(&there.xy()) + line_a.dot(&back.xy())) / length;
                 (b.dot(&there) - distance * length_by) / length
             });
-            let weight = (DOUBT_PIXELS / distance.abs()).min(1.0);
+            let (cost, weight) = huber(distance * distance, DOUBT_PIXELS * DOUBT_PIXELS);
             system.hessian += weight * jacobian * jacobian.transpose();
             system.gradient += weight * distance * jacobian;
-            system.cost += if weight < 1.0 { DOUBT_PIXELS * (2.0 * distance.abs() - DOUBT_PIXELS) } else { distance * distance };
+            system.cost += cost;
         }
         system
     }
