@@ -165,7 +165,8 @@ fn the_loss_and_its_whole_gradient_agree() {
 #[test]
 fn adam_steps_agree() {
     let Some(gpu) = gpu() else { return };
-    let (loss, adam) = (LossConfig::default(), AdamConfig { harmonics_every: 1, ..AdamConfig::default() });
+    let (loss, adam) =
+        (LossConfig::default(), AdamConfig { harmonics_every: 1, color_settling_steps: 2.0, ..AdamConfig::default() });
     let mut rng = Rng::with_seed(11);
     let camera = common::camera(&mut rng, 48, 32);
     let mut cloud = common::scene(&mut rng, 60, ShDegree::ALL[1]);
@@ -186,8 +187,9 @@ fn adam_steps_agree() {
             rates.extend([f64::from(adam.scale_rate); 3]);
             rates.extend([f64::from(adam.rotation_rate); 4]);
             rates.push(f64::from(adam.opacity_rate));
-            rates.extend([f64::from(adam.color_rate); 3]);
-            rates.extend([f64::from(adam.harmonics_rate); 9]);
+            let pace = (1.0 + f64::from(states[i].steps + 1) / 2.0).sqrt().recip();
+            rates.extend([f64::from(adam.color_rate) * pace; 3]);
+            rates.extend([f64::from(adam.harmonics_rate) * pace; 9]);
             let decay = (f64::from(adam.beta_1), f64::from(adam.beta_2), f64::from(adam.epsilon));
             states[i].step(&mut expected[i], &gradient.flat(), &rates, decay);
         }

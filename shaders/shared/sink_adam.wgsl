@@ -15,6 +15,8 @@ struct AdamSetup {
     step_harmonics: u32,
     // Logarithm of how many times longer than its second axis a Gaussian's longest may become.
     log_elongation: f32,
+    // Inverse of the number of steps with whose root the steps of colours shrink; 0: they don't.
+    color_settling: f32,
 }
 
 @group(0) @binding(6) var<storage, read_write> parameters: array<vec4<f32>>;
@@ -25,6 +27,8 @@ struct AdamSetup {
 // Bias corrections 1/(1 - βⁿ) of the first and the second moments after this step: of all planes, and of the higher harmonics.
 var<private> corrections: vec2<f32>;
 var<private> corrections_of_harmonics: vec2<f32>;
+// Share of their rates that the colours still take.
+var<private> color_pace: f32;
 // Geometric mean of the standard deviations, metres.
 var<private> size: f32;
 
@@ -33,6 +37,7 @@ fn begin_gradient(i: u32) {
     let log_scale = parameters[view.capacity + i];
     size = min(exp((log_scale.x + log_scale.y + log_scale.z) / 3.0), 1e3);
     corrections = count_step(view.capacity + i);
+    color_pace = inverseSqrt(1.0 + moments_1[view.capacity + i].w * adam.color_settling);
     if wants_harmonics() {
         corrections_of_harmonics = count_step(3u * view.capacity + i);
     }
@@ -66,7 +71,7 @@ fn store_gradient(plane: u32, i: u32, raw: vec4<f32>) {
     let m = mix(gradient, before, adam.beta_1);
     let v = mix(gradient * gradient, moments_2[at], adam.beta_2);
     let unit = select(vec4(1.0), vec4(size, size, size, 1.0), plane == 0u);
-    let rate = adam.rates[min(plane, 4u)] * unit * correction.x;
+    let rate = adam.rates[min(plane, 4u)] * unit * correction.x * select(color_pace, 1.0, plane < 3u);
     let moved = parameters[at] - rate * m / (sqrt(v * correction.y) + adam.epsilon);
     parameters[at] = select(moved, blunt(moved), plane == 1u);
     moments_1[at] = select(m, vec4(m.xyz, before.w), plane == 1u || plane == 3u);

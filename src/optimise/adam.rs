@@ -31,6 +31,9 @@ pub struct AdamConfig {
     pub epsilon: f32,
     /// How many times longer than its second axis a Gaussian's longest may become.
     pub max_elongation: f32,
+    /// After n steps of a Gaussian its colours take 1/√(1 + n / this) of their rates: they find their place fast, and then the views'
+    /// noise and exposures are averaged. 0: all of them always.
+    pub color_settling_steps: f32,
 }
 
 impl Default for AdamConfig {
@@ -47,6 +50,7 @@ impl Default for AdamConfig {
             beta_2: 0.999,
             epsilon: 1e-15,
             max_elongation: 8.0,
+            color_settling_steps: 200.0,
         }
     }
 }
@@ -64,6 +68,9 @@ impl AdamConfig {
         }
         if ![self.beta_1, self.beta_2].iter().all(|beta| (0.0..1.0).contains(beta)) || self.beta_1 == 0.0 || self.beta_2 == 0.0 {
             return Err("beta_1 and beta_2 must lie between 0 and 1, both excluded".into());
+        }
+        if !(self.color_settling_steps.is_finite() && self.color_settling_steps >= 0.0) {
+            return Err("color_settling_steps must be finite and not negative".into());
         }
         if !(self.max_elongation.is_finite() && self.max_elongation > 1.0) {
             return Err("max_elongation must be greater than 1".into());
@@ -107,7 +114,7 @@ impl AdamConfig {
             log_beta_2: self.beta_2.ln(),
             step_harmonics: u32::from(step.is_multiple_of(self.harmonics_every)),
             log_elongation: self.max_elongation.ln(),
-            pad: 0.0,
+            color_settling: if self.color_settling_steps > 0.0 { 1.0 / self.color_settling_steps } else { 0.0 },
         }
     }
 }

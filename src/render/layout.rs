@@ -246,7 +246,7 @@ host_twins! {
         log_beta_2: f32,
         step_harmonics: u32,
         log_elongation: f32,
-        pad: f32,
+        color_settling: f32,
     }
 }
 
