@@ -2,16 +2,15 @@
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<storage, read> counters: array<Counter>;
-@group(0) @binding(2) var<storage, read> seen: array<u32>;
 // See `tile_lists`.
-@group(0) @binding(3) var<storage, read> pair_counts: array<u32>;
-@group(0) @binding(4) var<storage, read> pair_scores: array<vec4<f32>>;
-@group(0) @binding(5) var<storage, read> projected: array<vec4<f32>>;
+@group(0) @binding(2) var<storage, read> pair_counts: array<u32>;
+@group(0) @binding(3) var<storage, read> pair_scores: array<vec4<f32>>;
+@group(0) @binding(4) var<storage, read> projected: array<vec4<f32>>;
 // [2, capacity], see `GaussianScore`: (wrong pixels, the same times each view's loss, Σ w, largest w); (‖∂‖, ‖Σ|∂|‖ in normalised
 // device coordinates, views that blended it, finest metres per pixel).
-@group(0) @binding(6) var<storage, read_write> scores: array<vec4<f32>>;
-@group(0) @binding(7) var<uniform> setup: ScoreSetup;
-@group(0) @binding(8) var<uniform> total: vec4<f32>;
+@group(0) @binding(5) var<storage, read_write> scores: array<vec4<f32>>;
+@group(0) @binding(6) var<uniform> setup: ScoreSetup;
+@group(0) @binding(7) var<uniform> total: vec4<f32>;
 
 struct ScoreSetup {
     error_ratio: f32,
@@ -31,7 +30,7 @@ fn main(
     if item >= counters[VISIBLE_COUNTER].count || counters[PAIR_COUNTER].count == 0u {
         return;
     }
-    let i = seen[item];
+    let i = pair_counts[3u * view.capacity + item];
     let end = pair_counts[view.capacity + 2u * i + 1u];
     var blended = vec4(0.0);
     var gradient = vec4(0.0);

@@ -6,12 +6,11 @@
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<storage, read> counters: array<Counter>;
-@group(0) @binding(2) var<storage, read> seen: array<u32>;
 // See `tile_lists`.
-@group(0) @binding(3) var<storage, read> pair_counts: array<u32>;
-@group(0) @binding(4) var<storage, read> pair_gradients: array<vec4<f32>>;
+@group(0) @binding(2) var<storage, read> pair_counts: array<u32>;
+@group(0) @binding(3) var<storage, read> pair_gradients: array<vec4<f32>>;
 // [workgroups, 2] sums over the workgroup of (∂L/∂ρ, 0), (∂L/∂θ, 0).
-@group(0) @binding(5) var<storage, read_write> pose_sums: array<vec4<f32>>;
+@group(0) @binding(4) var<storage, read_write> pose_sums: array<vec4<f32>>;
 
 var<workgroup> rho_sums: array<vec3<f32>, 256>;
 var<workgroup> theta_sums: array<vec3<f32>, 256>;
@@ -32,7 +31,7 @@ fn main(
     var pose = PoseGradient(vec3(0.0), vec3(0.0));
     // Without room for all pairs nothing was rendered: the step will be repeated.
     if item < counters[VISIBLE_COUNTER].count && counters[PAIR_COUNTER].count > 0u {
-        pose = backward(seen[item]);
+        pose = backward(pair_counts[3u * view.capacity + item]);
     }
     rho_sums[local] = pose.rho;
     theta_sums[local] = pose.theta;

@@ -14,7 +14,7 @@ struct TileListsSetup {
 @group(0) @binding(3) var<storage, read> order: array<u32>;
 @group(0) @binding(4) var<storage, read> projected: array<vec4<f32>>;
 // [visible] tiles of each Gaussian, nearest first (mode 0); behind them, from `capacity` on, its first slot and that past its last, in map
-// order (mode 1).
+// order (mode 1); and from three times that on, which Gaussians are visible, in map order (`compact_visible`).
 @group(0) @binding(5) var<storage, read_write> pair_counts: array<u32>;
 // [visible] where each Gaussian's slots begin, nearest first.
 @group(0) @binding(6) var<storage, read> pair_offsets: array<u32>;

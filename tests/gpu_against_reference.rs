@@ -161,12 +161,12 @@ fn the_loss_and_its_whole_gradient_agree() {
     }
 }
 
-/// Three steps of the fused kernel against the oracle's Adam fed with the GPU's own gradients.
+/// Steps of the fused kernel, and what they average to, against the oracle's Adam fed with the GPU's own gradients.
 #[test]
 fn adam_steps_agree() {
     let Some(gpu) = gpu() else { return };
-    let (loss, adam) =
-        (LossConfig::default(), AdamConfig { harmonics_every: 1, color_settling_steps: 2.0, ..AdamConfig::default() });
+    let loss = LossConfig::default();
+    let adam = AdamConfig { harmonics_every: 1, color_settling_steps: 2.0, averaged_steps: 1.5, ..AdamConfig::default() };
     let mut rng = Rng::with_seed(11);
     let camera = common::camera(&mut rng, 48, 32);
     let mut cloud = common::scene(&mut rng, 60, ShDegree::ALL[1]);
@@ -179,7 +179,7 @@ fn adam_steps_agree() {
     let on_gpu = upload(&gpu, &cloud);
     let mut expected: Vec<Vec<f64>> = cloud64(&cloud).iter().map(Gaussian64::flat).collect();
     let mut states = vec![Adam64::default(); cloud.len()];
-    for _ in 0..3 {
+    for _ in 0..4 {
         let gradients = optimiser.gradients(&mut rasterizer, &on_gpu, &camera, &image, &loss).unwrap();
         for (i, gradient) in cloud64(&gradients.cloud).iter().enumerate() {
             let size = (expected[i][3..6].iter().sum::<f64>() / 3.0).exp();
@@ -191,7 +191,11 @@ fn adam_steps_agree() {
             rates.extend([f64::from(adam.color_rate) * pace; 3]);
             rates.extend([f64::from(adam.harmonics_rate) * pace; 9]);
             let decay = (f64::from(adam.beta_1), f64::from(adam.beta_2), f64::from(adam.epsilon));
+            let before = states[i].steps;
             states[i].step(&mut expected[i], &gradient.flat(), &rates, decay);
+            if states[i].steps > before {
+                states[i].take_average(&expected[i], 1.0 / 1.5);
+            }
         }
         let view = TrainingView::new(camera, &image);
         optimiser.steps(&mut rasterizer, &on_gpu, &[view], (&loss, &adam)).unwrap();
@@ -199,7 +203,9 @@ fn adam_steps_agree() {
     let moved = on_gpu.download(&gpu).unwrap();
     let start = flat(&cloud64(&cloud));
     let travel = |to: &[f64]| to.iter().zip(&start).map(|(a, b)| a - b).collect::<Vec<f64>>();
-    let error = common::relative_error(&travel(&flat(&cloud64(&moved))), &travel(&expected.concat()));
+    let average = |(state, start): (&Adam64, Vec<f64>)| if state.steps > 0 { state.average.clone() } else { start };
+    let averages: Vec<f64> = states.iter().zip(cloud64(&cloud).iter().map(Gaussian64::flat)).flat_map(average).collect();
+    let error = common::relative_error(&travel(&flat(&cloud64(&moved))), &travel(&averages));
     assert!(error < 1e-3, "Adam: {error:e}");
     assert_eq!(moved.get(5), cloud.get(5), "an unseen Gaussian moved");
 }

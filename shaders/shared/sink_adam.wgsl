@@ -17,18 +17,28 @@ struct AdamSetup {
     log_elongation: f32,
     // Inverse of the number of steps with whose root the steps of colours shrink; 0: they don't.
     color_settling: f32,
+    // Least share that the present parameters have in their averages.
+    least_share: f32,
 }
 
-@group(0) @binding(6) var<storage, read_write> parameters: array<vec4<f32>>;
-@group(0) @binding(7) var<storage, read_write> moments_1: array<vec4<f32>>;
-@group(0) @binding(8) var<storage, read_write> moments_2: array<vec4<f32>>;
-@group(0) @binding(9) var<uniform> adam: AdamSetup;
+// The share after n steps is 1/(1 + n/this), but the least at least.
+const AVERAGED_PART: f32 = 4.0;
+
+@group(0) @binding(5) var<storage, read_write> parameters: array<vec4<f32>>;
+@group(0) @binding(6) var<storage, read_write> moments_1: array<vec4<f32>>;
+@group(0) @binding(7) var<storage, read_write> moments_2: array<vec4<f32>>;
+@group(0) @binding(8) var<uniform> adam: AdamSetup;
+// The parameters over each Gaussian's last steps, on average: where successive views pull to and fro, it stays in between. Lane w of plane
+// 1 counts the steps.
+@group(0) @binding(9) var<storage, read_write> averages: array<vec4<f32>>;
 
 // Bias corrections 1/(1 - βⁿ) of the first and the second moments after this step: of all planes, and of the higher harmonics.
 var<private> corrections: vec2<f32>;
 var<private> corrections_of_harmonics: vec2<f32>;
 // Share of their rates that the colours still take.
 var<private> color_pace: f32;
+// Share of the present parameters in their averages, 0 to 1.
+var<private> share: f32;
 // Geometric mean of the standard deviations, metres.
 var<private> size: f32;
 
@@ -38,6 +48,7 @@ fn begin_gradient(i: u32) {
     size = min(exp((log_scale.x + log_scale.y + log_scale.z) / 3.0), 1e3);
     corrections = count_step(view.capacity + i);
     color_pace = inverseSqrt(1.0 + moments_1[view.capacity + i].w * adam.color_settling);
+    share = max(1.0 / (1.0 + averages[view.capacity + i].w / AVERAGED_PART), adam.least_share);
     if wants_harmonics() {
         corrections_of_harmonics = count_step(3u * view.capacity + i);
     }
@@ -73,7 +84,11 @@ fn store_gradient(plane: u32, i: u32, raw: vec4<f32>) {
     let unit = select(vec4(1.0), vec4(size, size, size, 1.0), plane == 0u);
     let rate = adam.rates[min(plane, 4u)] * unit * correction.x * select(color_pace, 1.0, plane < 3u);
     let moved = parameters[at] - rate * m / (sqrt(v * correction.y) + adam.epsilon);
-    parameters[at] = select(moved, blunt(moved), plane == 1u);
+    let now = select(moved, blunt(moved), plane == 1u);
+    parameters[at] = now;
+    let average = averages[at];
+    let mean = mix(average, now, share);
+    averages[at] = select(mean, vec4(mean.xyz, average.w + 1.0), plane == 1u);
     moments_1[at] = select(m, vec4(m.xyz, before.w), plane == 1u || plane == 3u);
     moments_2[at] = v;
 }

@@ -108,7 +108,7 @@ impl SkipConfig {
 
 impl Default for SkipConfig {
     fn default() -> Self {
-        Self { draw_by_loss: true, coarse_share: 0.0, min_gain: 0.01, tile_share: 0.5, tile_least: 0.1, tile_noise: 0.0 }
+        Self { draw_by_loss: true, coarse_share: 0.0, min_gain: 0.01, tile_share: 0.7, tile_least: 0.1, tile_noise: 0.0 }
     }
 }
 

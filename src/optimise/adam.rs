@@ -34,6 +34,10 @@ pub struct AdamConfig {
     /// After n steps of a Gaussian its colours take 1/√(1 + n / this) of their rates: they find their place fast, and then the views'
     /// noise and exposures are averaged. 0: all of them always.
     pub color_settling_steps: f32,
+    /// The map is shown with each Gaussian's parameters averaged over about a quarter of its steps so far, but no more than about so many
+    /// of its last ones (Polyak & Juditsky 1992): successive views pull to and fro, and in between is where they agree. The steps
+    /// themselves go on from the parameters as they are, and stay quick. 1: the map is shown as it is.
+    pub averaged_steps: f32,
 }
 
 impl Default for AdamConfig {
@@ -51,6 +55,7 @@ impl Default for AdamConfig {
             epsilon: 1e-15,
             max_elongation: 8.0,
             color_settling_steps: 200.0,
+            averaged_steps: 10.0,
         }
     }
 }
@@ -71,6 +76,9 @@ impl AdamConfig {
         }
         if !(self.color_settling_steps.is_finite() && self.color_settling_steps >= 0.0) {
             return Err("color_settling_steps must be finite and not negative".into());
+        }
+        if !(self.averaged_steps.is_finite() && self.averaged_steps >= 1.0) {
+            return Err("averaged_steps must be at least 1".into());
         }
         if !(self.max_elongation.is_finite() && self.max_elongation > 1.0) {
             return Err("max_elongation must be greater than 1".into());
@@ -115,6 +123,8 @@ impl AdamConfig {
             step_harmonics: u32::from(step.is_multiple_of(self.harmonics_every)),
             log_elongation: self.max_elongation.ln(),
             color_settling: if self.color_settling_steps > 0.0 { 1.0 / self.color_settling_steps } else { 0.0 },
+            least_share: 1.0 / self.averaged_steps,
+            pad: [0.0; 3],
         }
     }
 }

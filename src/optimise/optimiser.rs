@@ -298,7 +298,7 @@ impl Optimiser {
         if let Objective::Image { loss: (loss, _), skip: Some(skip), .. } = objective {
             self.skipped.encode_select(&mut pass, rasterizer, &self.images[0], loss, skip);
         }
-        rasterizer.encode_forward(&mut pass, cloud, &prepared);
+        rasterizer.encode_forward(&mut pass, cloud.parameters(), &prepared);
         if let Objective::Image { loss, scored, skip, .. } = objective {
             skip.iter().for_each(|_| self.skipped.encode_fill(&mut pass, rasterizer, &self.images[0]));
             self.encode_loss(&mut pass, rasterizer, *loss);
@@ -355,20 +355,19 @@ impl Optimiser {
         let mut project = vec![
             (0, rasterizer.view()),
             (1, &ws.counters),
-            (2, &ws.seen),
-            (3, &ws.pair_counts),
-            (4, &ws.pair_gradients),
-            (5, &self.pose_sums),
-            (6, cloud.parameters()),
+            (2, &ws.pair_counts),
+            (3, &ws.pair_gradients),
+            (4, &self.pose_sums),
+            (5, cloud.parameters()),
         ];
         let arguments = (&ws.counters, Counter::per_element_offset(VISIBLE_COUNTER));
         let kernel = match sink {
             Sink::Adam => {
-                project.extend([(7, cloud.moments_1()), (8, cloud.moments_2()), (9, &self.adam)]);
+                project.extend([(6, cloud.moments_1()), (7, cloud.moments_2()), (8, &self.adam), (9, cloud.averages())]);
                 &k.project_backward_adam
             }
             Sink::Gradient(buffer) => {
-                project.push((7, *buffer));
+                project.push((6, *buffer));
                 &k.project_backward
             }
         };

@@ -106,13 +106,12 @@ impl Scores {
         let gather = [
             (0, rasterizer.view()),
             (1, &ws.counters),
-            (2, &ws.seen),
-            (3, &ws.pair_counts),
-            (4, &ws.pair_gradients),
-            (5, &ws.projected),
-            (6, &self.scores),
-            (7, &self.setup),
-            (8, loss_total),
+            (2, &ws.pair_counts),
+            (3, &ws.pair_gradients),
+            (4, &ws.projected),
+            (5, &self.scores),
+            (6, &self.setup),
+            (7, loss_total),
         ];
         let visible = (&ws.counters, Counter::per_element_offset(VISIBLE_COUNTER));
         self.gather.dispatch_indirect(gpu, pass, &gather, visible);

@@ -1,11 +1,12 @@
 //! One Adam step (Kingma & Ba 2015) on a row of numbers; twin of `shaders/shared/sink_adam.wgsl`.
 
-/// Moments and step count of one Gaussian.
+/// Moments, step count and averaged parameters of one Gaussian.
 #[derive(Clone, Debug, Default)]
 pub struct Adam64 {
     pub first: Vec<f64>,
     pub second: Vec<f64>,
     pub steps: i32,
+    pub average: Vec<f64>,
 }
 
 impl Adam64 {
@@ -24,5 +25,12 @@ impl Adam64 {
             let v = self.second[i] / (1.0 - beta_2.powi(self.steps));
             parameters[i] -= rates[i] * m / (v.sqrt() + epsilon);
         }
+    }
+
+    /// Takes the parameters into their average, after a step that moved them.
+    pub fn take_average(&mut self, parameters: &[f64], least_share: f64) {
+        self.average.resize(parameters.len(), 0.0);
+        let share = least_share.max(1.0 / (1.0 + f64::from(self.steps - 1) / 4.0));
+        self.average.iter_mut().zip(parameters).for_each(|(average, now)| *average += share * (now - *average));
     }
 }

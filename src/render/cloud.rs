@@ -24,15 +24,17 @@ pub struct GpuCloud {
     parameters: GpuBuffer,
     moments_1: GpuBuffer,
     moments_2: GpuBuffer,
+    /// What the parameters were over each Gaussian's last steps, on average.
+    averages: GpuBuffer,
     gather: Kernel,
 }
 
-/// A map with its moments, read back.
+/// A map with its moments and averages, read back.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct CloudState {
     capacity: usize,
     limit: Option<usize>,
-    /// `[3, planes, N]`: parameters, first and second moments.
+    /// `[4, planes, N]`: parameters, first and second moments, averages.
     #[serde(with = "plain")]
     values: Vec<[f32; 4]>,
 }
@@ -41,9 +43,9 @@ impl GpuCloud {
     /// An empty map with room for `capacity` Gaussians; it grows as needed.
     pub fn new(gpu: &Gpu, sh_degree: ShDegree, capacity: usize) -> Result<Self, GpuError> {
         let capacity = capacity.max(256);
-        let [parameters, moments_1, moments_2] = allocate(gpu, sh_degree, capacity)?;
+        let [parameters, moments_1, moments_2, averages] = allocate(gpu, sh_degree, capacity)?;
         let gather = Kernel::new(gpu, "gather", "main", &shaders::GATHER.text(BlendForm::default()));
-        Ok(Self { sh_degree, count: 0, capacity, limit: None, parameters, moments_1, moments_2, gather })
+        Ok(Self { sh_degree, count: 0, capacity, limit: None, parameters, moments_1, moments_2, averages, gather })
     }
 
     pub fn len(&self) -> usize {
@@ -62,9 +64,9 @@ impl GpuCloud {
         self.sh_degree
     }
 
-    /// Bytes of each Gaussian: parameters and two moments.
+    /// Bytes of each Gaussian: parameters, two moments and averages.
     pub fn bytes_each(&self) -> u64 {
-        self.planes() as u64 * 48
+        self.planes() as u64 * 64
     }
 
     /// Buffers are made for at most `limit` Gaussians from now on; whoever appends must keep to it.
@@ -89,6 +91,11 @@ impl GpuCloud {
         &self.moments_2
     }
 
+    /// The averages of the parameters over each Gaussian's last steps: the map as it is shown.
+    pub fn averages(&self) -> &GpuBuffer {
+        &self.averages
+    }
+
     /// Appends Gaussians with zero moments. Those that hold a NaN or an infinity are left out; their number is returned.
     pub fn append(&mut self, gpu: &Gpu, cloud: &GaussianCloud) -> Result<usize, GpuError> {
         assert_eq!(cloud.sh_degree, self.sh_degree, "a map has one spherical-harmonics degree");
@@ -103,6 +110,7 @@ impl GpuCloud {
             let values: Vec<[f32; 4]> = finite.iter().map(|&i| plane_value(cloud, plane, i)).collect();
             let first = plane * self.capacity + self.count;
             self.parameters.write(gpu, first, &values);
+            self.averages.write(gpu, first, &values);
             self.moments_1.write(gpu, first, &zeros);
             self.moments_2.write(gpu, first, &zeros);
         }
@@ -121,6 +129,7 @@ impl GpuCloud {
         for plane in 0..2 {
             let values: Vec<[f32; 4]> = geometry.iter().map(|g| g[plane]).collect();
             self.parameters.write(gpu, plane * self.capacity + keep.len(), &values);
+            self.averages.write(gpu, plane * self.capacity + keep.len(), &values);
         }
         Ok(())
     }
@@ -142,30 +151,34 @@ impl GpuCloud {
         if runs.is_empty() {
             return Ok(());
         }
-        let mut means = self.read_plane(gpu, 0)?;
-        let mut rotations = self.read_plane(gpu, 2)?;
-        for (run, motion) in runs {
-            let [x, y, z, w] = motion.rotation.coords.map(|v| v as f32).into();
-            let turn = Quat::from_xyzw(x, y, z, w);
-            for (mean, rotation) in means[run.clone()].iter_mut().zip(&mut rotations[run.clone()]) {
-                let p = motion * Point3::new(f64::from(mean[0]), f64::from(mean[1]), f64::from(mean[2]));
-                *mean = [p.x as f32, p.y as f32, p.z as f32, mean[3]];
-                let q = turn * Quat::from_xyzw(rotation[1], rotation[2], rotation[3], rotation[0]);
-                *rotation = [q.w, q.x, q.y, q.z];
+        for planes in [&self.parameters, &self.averages] {
+            let mut means: Vec<[f32; 4]> = planes.read(gpu, 0, self.count)?;
+            let mut rotations: Vec<[f32; 4]> = planes.read(gpu, 2 * self.capacity, self.count)?;
+            for (run, motion) in runs {
+                let [x, y, z, w] = motion.rotation.coords.map(|v| v as f32).into();
+                let turn = Quat::from_xyzw(x, y, z, w);
+                for (mean, rotation) in means[run.clone()].iter_mut().zip(&mut rotations[run.clone()]) {
+                    let p = motion * Point3::new(f64::from(mean[0]), f64::from(mean[1]), f64::from(mean[2]));
+                    *mean = [p.x as f32, p.y as f32, p.z as f32, mean[3]];
+                    let q = turn * Quat::from_xyzw(rotation[1], rotation[2], rotation[3], rotation[0]);
+                    *rotation = [q.w, q.x, q.y, q.z];
+                }
             }
+            planes.write(gpu, 0, &means);
+            planes.write(gpu, 2 * self.capacity, &rotations);
+        }
+        for (run, _) in runs {
             let zeros = vec![[0.0f32; 4]; run.len()];
             for plane in 0..self.planes() {
                 self.moments_1.write(gpu, plane * self.capacity + run.start, &zeros);
                 self.moments_2.write(gpu, plane * self.capacity + run.start, &zeros);
             }
         }
-        self.parameters.write(gpu, 0, &means);
-        self.parameters.write(gpu, 2 * self.capacity, &rotations);
         Ok(())
     }
 
     fn rebuild(&mut self, gpu: &Gpu, chosen: &[u32], capacity: usize) -> Result<(), GpuError> {
-        let [parameters, moments_1, moments_2] = allocate(gpu, self.sh_degree, capacity)?;
+        let [parameters, moments_1, moments_2, averages] = allocate(gpu, self.sh_degree, capacity)?;
         let list = GpuBuffer::storage(gpu, "chosen", (chosen.len() * 4) as u64)?;
         list.write(gpu, 0, chosen);
         let setup = GatherSetup {
@@ -179,14 +192,19 @@ impl GpuCloud {
         {
             let mut pass = encoder.begin_compute_pass(&Default::default());
             let size = workgroups((chosen.len() as u32).div_ceil(256));
-            for (from, to) in [(&self.parameters, &parameters), (&self.moments_1, &moments_1), (&self.moments_2, &moments_2)] {
+            let moved = [&parameters, &moments_1, &moments_2, &averages];
+            for (from, to) in self.buffers().into_iter().zip(moved) {
                 self.gather.dispatch(gpu, &mut pass, &[(0, &setup), (1, &list), (2, from), (3, to)], size);
             }
         }
         gpu.queue.submit([encoder.finish()]);
-        (self.parameters, self.moments_1, self.moments_2) = (parameters, moments_1, moments_2);
+        (self.parameters, self.moments_1, self.moments_2, self.averages) = (parameters, moments_1, moments_2, averages);
         (self.count, self.capacity) = (chosen.len(), capacity);
         Ok(())
+    }
+
+    fn buffers(&self) -> [&GpuBuffer; 4] {
+        [&self.parameters, &self.moments_1, &self.moments_2, &self.averages]
     }
 
     /// Reads one plane of the parameters, `[count]`.
@@ -194,16 +212,18 @@ impl GpuCloud {
         self.parameters.read(gpu, plane * self.capacity, self.count)
     }
 
-    /// Reads the whole map.
+    /// Reads the whole map as it is shown: the averages.
     pub fn download(&self, gpu: &Gpu) -> Result<GaussianCloud, GpuError> {
-        let read = (0..self.planes()).map(|plane| self.read_plane(gpu, plane)).collect::<Result<Vec<_>, _>>()?;
+        let plane = |plane| self.averages.read(gpu, plane * self.capacity, self.count);
+        let read = (0..self.planes()).map(plane).collect::<Result<Vec<_>, _>>()?;
         Ok(cloud_from_planes(self.sh_degree, &read))
     }
 
     /// All that training needs to go on as if it had never stopped.
     pub fn state(&self, gpu: &Gpu) -> Result<CloudState, GpuError> {
-        let mut values = Vec::with_capacity(3 * self.planes() * self.count);
-        for buffer in [&self.parameters, &self.moments_1, &self.moments_2] {
+        let buffers = self.buffers();
+        let mut values = Vec::with_capacity(buffers.len() * self.planes() * self.count);
+        for buffer in buffers {
             for plane in 0..self.planes() {
                 values.extend(buffer.read::<[f32; 4]>(gpu, plane * self.capacity, self.count)?);
             }
@@ -214,13 +234,13 @@ impl GpuCloud {
     /// The map of a state, to the bit; `None` if that is no map of this degree.
     pub fn restore(gpu: &Gpu, sh_degree: ShDegree, state: &CloudState) -> Result<Option<Self>, GpuError> {
         let planes = planes(sh_degree);
-        let count = state.values.len() / (3 * planes);
-        if state.values.len() != 3 * planes * count || state.capacity < count {
+        let count = state.values.len() / (4 * planes);
+        if state.values.len() != 4 * planes * count || state.capacity < count {
             return Ok(None);
         }
         let mut cloud = Self::new(gpu, sh_degree, state.capacity)?;
         (cloud.count, cloud.limit) = (count, state.limit);
-        let buffers = [&cloud.parameters, &cloud.moments_1, &cloud.moments_2];
+        let buffers = cloud.buffers();
         for (i, plane) in state.values.chunks_exact(count.max(1)).enumerate() {
             buffers[i / planes].write(gpu, (i % planes) * cloud.capacity, plane);
         }
@@ -263,11 +283,12 @@ fn is_finite(cloud: &GaussianCloud, i: usize) -> bool {
     (0..planes(cloud.sh_degree)).all(|plane| plane_value(cloud, plane, i).iter().all(|v| v.is_finite()))
 }
 
-fn allocate(gpu: &Gpu, sh_degree: ShDegree, capacity: usize) -> Result<[GpuBuffer; 3], GpuError> {
+fn allocate(gpu: &Gpu, sh_degree: ShDegree, capacity: usize) -> Result<[GpuBuffer; 4], GpuError> {
     let bytes = (planes(sh_degree) * capacity * 16) as u64;
     Ok([
         GpuBuffer::storage(gpu, "Gaussian parameters", bytes)?,
         GpuBuffer::storage(gpu, "first moments", bytes)?,
         GpuBuffer::storage(gpu, "second moments", bytes)?,
+        GpuBuffer::storage(gpu, "averaged parameters", bytes)?,
     ])
 }

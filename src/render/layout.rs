@@ -247,6 +247,8 @@ host_twins! {
         step_harmonics: u32,
         log_elongation: f32,
         color_settling: f32,
+        least_share: f32,
+        pad: [f32; 3],
     }
 }
 

@@ -172,12 +172,12 @@ impl Rasterizer {
     }
 
     /// Encodes the forward pass.
-    pub fn encode_forward(&self, pass: &mut wgpu::ComputePass<'_>, cloud: &GpuCloud, prepared: &PreparedView) {
+    pub fn encode_forward(&self, pass: &mut wgpu::ComputePass<'_>, parameters: &GpuBuffer, prepared: &PreparedView) {
         let (gpu, ws, k) = (&*self.gpu, &self.workspace, &self.kernels);
         let (view, uniform) = (&prepared.view, &self.view);
         let count = view.gaussian_count;
         let per_gaussian = workgroups(count.div_ceil(256));
-        let project = [(0, uniform), (1, cloud.parameters()), (2, &ws.projected), (3, &ws.visible), (4, &ws.skipped)];
+        let project = [(0, uniform), (1, parameters), (2, &ws.projected), (3, &ws.visible), (4, &ws.skipped)];
         k.project_forward.dispatch(gpu, pass, &project, per_gaussian);
         let job = ScanJob { setup: &self.visible_scan, values: &ws.visible, prefix: &ws.prefix, bound: count };
         k.scan.encode(gpu, pass, ws, &job);
@@ -188,7 +188,7 @@ impl Rasterizer {
             (3, &ws.projected),
             (4, &ws.depth_keys[0]),
             (5, &ws.order[0]),
-            (6, &ws.seen),
+            (6, &ws.pair_counts),
         ];
         k.compact_visible.dispatch(gpu, pass, &compact, per_gaussian);
         k.sort.encode(gpu, pass, ws, (&ws.depth_keys, &ws.order), (VISIBLE_COUNTER, DEPTH_KEY_BITS));
@@ -264,7 +264,7 @@ impl Rasterizer {
             let prepared = self.prepare(cloud, camera, background)?;
             let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
             self.encode_clear(&mut encoder);
-            self.encode_forward(&mut encoder.begin_compute_pass(&Default::default()), cloud, &prepared);
+            self.encode_forward(&mut encoder.begin_compute_pass(&Default::default()), cloud.averages(), &prepared);
             self.gpu.queue.submit([encoder.finish()]);
             if self.finish()?.is_none() {
                 continue;

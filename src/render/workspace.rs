@@ -23,9 +23,7 @@ pub struct Workspace {
     pub(super) depth_keys: [GpuBuffer; 2],
     /// Visible Gaussians, nearest first, in `[0]` after the depth sort.
     pub(super) order: [GpuBuffer; 2],
-    /// Visible Gaussians in map order.
-    pub seen: GpuBuffer,
-    /// Per visible Gaussian its pairs, nearest first; then per Gaussian where its slots begin and end.
+    /// Per visible Gaussian its pairs, nearest first; then per Gaussian where its slots begin and end; then the visible ones in map order.
     pub pair_counts: GpuBuffer,
     pub(super) pair_offsets: GpuBuffer,
     // Per pair.
@@ -67,7 +65,6 @@ impl Workspace {
             block_sums: empty("block sums")?,
             depth_keys: [empty("depth keys")?, empty("depth keys")?],
             order: [empty("order")?, empty("order")?],
-            seen: empty("seen")?,
             pair_counts: empty("pair counts")?,
             pair_offsets: empty("pair offsets")?,
             pair_capacity: 0,
@@ -110,8 +107,7 @@ impl Workspace {
         self.block_sums = GpuBuffer::storage(gpu, "block sums", (capacity as u64).div_ceil(u64::from(SCAN_BLOCK)) * 4)?;
         self.depth_keys = [words("depth keys")?, words("depth keys")?];
         self.order = [words("order")?, words("order")?];
-        self.seen = words("seen")?;
-        self.pair_counts = GpuBuffer::storage(gpu, "pair counts", capacity as u64 * 12)?;
+        self.pair_counts = GpuBuffer::storage(gpu, "pair counts", capacity as u64 * 16)?;
         self.pair_offsets = words("pair offsets")?;
         self.capacity = capacity;
         self.reserve_histogram(gpu)
