@@ -207,15 +207,14 @@ impl GpuCloud {
         [&self.parameters, &self.moments_1, &self.moments_2, &self.averages]
     }
 
-    /// Reads one plane of the parameters, `[count]`.
+    /// Reads one plane of the map as it is shown, `[count]`: of the averages.
     pub fn read_plane(&self, gpu: &Gpu, plane: usize) -> Result<Vec<[f32; 4]>, GpuError> {
-        self.parameters.read(gpu, plane * self.capacity, self.count)
+        self.averages.read(gpu, plane * self.capacity, self.count)
     }
 
-    /// Reads the whole map as it is shown: the averages.
+    /// Reads the whole map as it is shown.
     pub fn download(&self, gpu: &Gpu) -> Result<GaussianCloud, GpuError> {
-        let plane = |plane| self.averages.read(gpu, plane * self.capacity, self.count);
-        let read = (0..self.planes()).map(plane).collect::<Result<Vec<_>, _>>()?;
+        let read = (0..self.planes()).map(|plane| self.read_plane(gpu, plane)).collect::<Result<Vec<_>, _>>()?;
         Ok(cloud_from_planes(self.sh_degree, &read))
     }
 

@@ -88,7 +88,7 @@ impl Default for VcdConfig {
             wrong_pixels: 5.0,
             absolute_gradient: 1.2e-3,
             split_pixels: 1.5,
-            max_growth: 0.03,
+            max_growth: 0.015,
             min_age: 2,
             min_weight: 0.02,
             min_worth: 1.5,
