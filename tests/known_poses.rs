@@ -81,7 +81,8 @@ fn photos_are_mapped_from_points_whatever_their_unit() {
         assert_eq!((m.keyframes, m.frames_tracked), (Some(FRAMES as u64 - 3), FRAMES as u64), "{m}");
         m.images.held_out.unwrap().psnr_db.unwrap()
     });
-    assert!(psnr[0] > 17.0 && (psnr[0] - psnr[1]).abs() < 0.5, "{psnr:?}");
+    // Cubes of points are powers of two of the unit, so the two maps begin with a tenth more or fewer points.
+    assert!(psnr[0] > 24.0 && (psnr[0] - psnr[1]).abs() < 1.0, "{psnr:?}");
 }
 
 #[test]

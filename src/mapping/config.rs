@@ -213,8 +213,9 @@ impl MappingConfig {
     /// For recordings whose poses are known: keyframes only arrive, and the refinement makes the map.
     pub fn offline() -> Self {
         let refine = RefineConfig { steps: 6000, ..RefineConfig::default() };
-        // Points and seeds lie further from where they belong than those of a depth image do. The refinement lets all rates fall by itself.
-        let adam = AdamConfig { position_rate: 0.16, color_settling_steps: 0.0, ..AdamConfig::default() };
+        // Points and seeds lie further from where they belong than those of a depth image do. The refinement lets all rates fall by itself,
+        // which leaves averages nothing but to lag behind.
+        let adam = AdamConfig { position_rate: 0.16, color_settling_steps: 0.0, averaged_steps: 1.0, ..AdamConfig::default() };
         // No keyframe seeds anything during the refinement: what the first Gaussians miss must grow out of them.
         let mut density = DensityConfig::default();
         density.vcd.max_growth = 0.15;
