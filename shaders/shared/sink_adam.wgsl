@@ -88,7 +88,7 @@ fn store_gradient(plane: u32, i: u32, raw: vec4<f32>) {
     parameters[at] = now;
     let average = averages[at];
     let mean = mix(average, now, share);
-    averages[at] = select(mean, vec4(mean.xyz, average.w + 1.0), plane == 1u);
+    averages[at] = select(mean, vec4(blunt(mean).xyz, average.w + 1.0), plane == 1u);
     moments_1[at] = select(m, vec4(m.xyz, before.w), plane == 1u || plane == 3u);
     moments_2[at] = v;
 }
