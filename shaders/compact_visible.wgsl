@@ -6,7 +6,7 @@
 @group(0) @binding(3) var<storage, read> projected: array<vec4<f32>>;
 @group(0) @binding(4) var<storage, read_write> depth_keys: array<u32>;
 @group(0) @binding(5) var<storage, read_write> indices: array<u32>;
-// The list in map order goes to its third part; see `tile_lists`.
+// The list in map order goes to its last part; see `tile_lists`.
 @group(0) @binding(6) var<storage, read_write> pair_counts: array<u32>;
 
 @compute @workgroup_size(256)

@@ -1,4 +1,4 @@
-//! The map's Gaussians on the GPU: parameters and Adam moments in planes of vec4.
+//! The map's Gaussians on the GPU: parameters, Adam's moments and averages of the parameters, in planes of vec4.
 
 use std::ops::Range;
 
@@ -11,6 +11,9 @@ use super::shaders;
 use crate::geometry::Se3;
 use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, plain, workgroups};
 use crate::splat::{GaussianCloud, ShDegree};
+
+/// Parameters, first and second moments, averages.
+const BUFFERS: usize = 4;
 
 /// Gaussians on the GPU, `[planes, capacity]` vec4 in each buffer. Plane 0 holds position and raw opacity, 1 the log scale,
 /// 2 the rotation (w, x, y, z), 3 the constant colour, 4… the other harmonics, RGB each.
@@ -34,7 +37,7 @@ pub struct GpuCloud {
 pub struct CloudState {
     capacity: usize,
     limit: Option<usize>,
-    /// `[4, planes, N]`: parameters, first and second moments, averages.
+    /// `[BUFFERS, planes, N]`: parameters, first and second moments, averages.
     #[serde(with = "plain")]
     values: Vec<[f32; 4]>,
 }
@@ -66,7 +69,7 @@ impl GpuCloud {
 
     /// Bytes of each Gaussian: parameters, two moments and averages.
     pub fn bytes_each(&self) -> u64 {
-        self.planes() as u64 * 64
+        (BUFFERS * self.planes() * 16) as u64
     }
 
     /// Buffers are made for at most `limit` Gaussians from now on; whoever appends must keep to it.
@@ -203,7 +206,8 @@ impl GpuCloud {
         Ok(())
     }
 
-    fn buffers(&self) -> [&GpuBuffer; 4] {
+    /// All of them, in the order of [`CloudState`].
+    fn buffers(&self) -> [&GpuBuffer; BUFFERS] {
         [&self.parameters, &self.moments_1, &self.moments_2, &self.averages]
     }
 
@@ -220,9 +224,8 @@ impl GpuCloud {
 
     /// All that training needs to go on as if it had never stopped.
     pub fn state(&self, gpu: &Gpu) -> Result<CloudState, GpuError> {
-        let buffers = self.buffers();
-        let mut values = Vec::with_capacity(buffers.len() * self.planes() * self.count);
-        for buffer in buffers {
+        let mut values = Vec::with_capacity(BUFFERS * self.planes() * self.count);
+        for buffer in self.buffers() {
             for plane in 0..self.planes() {
                 values.extend(buffer.read::<[f32; 4]>(gpu, plane * self.capacity, self.count)?);
             }
@@ -233,8 +236,8 @@ impl GpuCloud {
     /// The map of a state, to the bit; `None` if that is no map of this degree.
     pub fn restore(gpu: &Gpu, sh_degree: ShDegree, state: &CloudState) -> Result<Option<Self>, GpuError> {
         let planes = planes(sh_degree);
-        let count = state.values.len() / (4 * planes);
-        if state.values.len() != 4 * planes * count || state.capacity < count {
+        let count = state.values.len() / (BUFFERS * planes);
+        if state.values.len() != BUFFERS * planes * count || state.capacity < count {
             return Ok(None);
         }
         let mut cloud = Self::new(gpu, sh_degree, state.capacity)?;
@@ -282,7 +285,7 @@ fn is_finite(cloud: &GaussianCloud, i: usize) -> bool {
     (0..planes(cloud.sh_degree)).all(|plane| plane_value(cloud, plane, i).iter().all(|v| v.is_finite()))
 }
 
-fn allocate(gpu: &Gpu, sh_degree: ShDegree, capacity: usize) -> Result<[GpuBuffer; 4], GpuError> {
+fn allocate(gpu: &Gpu, sh_degree: ShDegree, capacity: usize) -> Result<[GpuBuffer; BUFFERS], GpuError> {
     let bytes = (planes(sh_degree) * capacity * 16) as u64;
     Ok([
         GpuBuffer::storage(gpu, "Gaussian parameters", bytes)?,

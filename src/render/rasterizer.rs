@@ -171,7 +171,7 @@ impl Rasterizer {
         encoder.clear_buffer(self.workspace.counters.raw(), 0, None);
     }
 
-    /// Encodes the forward pass.
+    /// Encodes the forward pass over a map's parameters or their averages.
     pub fn encode_forward(&self, pass: &mut wgpu::ComputePass<'_>, parameters: &GpuBuffer, prepared: &PreparedView) {
         let (gpu, ws, k) = (&*self.gpu, &self.workspace, &self.kernels);
         let (view, uniform) = (&prepared.view, &self.view);
