@@ -122,10 +122,8 @@ impl Mapper {
                 ..KeyframeReport::default()
             });
         }
-        let (done, psnr_db) = self.optimise(iterations, stop)?;
-        let (pruned, grown) = self.control_density()?;
-        let (gaussians, iterations) = (self.cloud.len(), done);
-        Ok(KeyframeReport { id: keyframe.id, seeded, pruned, grown, gaussians, iterations, psnr_db, exposure })
+        let report = self.optimise(iterations, stop)?;
+        Ok(KeyframeReport { id: keyframe.id, seeded, gaussians: self.cloud.len(), exposure, ..report })
     }
 
     /// Takes in points of the scene that are known before any keyframe, in the keyframes' world; `anchor` is the first of these.
@@ -260,7 +258,7 @@ impl Mapper {
         wanted.then(|| self.config.density.wrong_pixels())
     }
 
-    /// Removes and divides Gaussians by the scores of the last steps; returns how many fewer and how many more there are for it.
+    /// Removes and divides Gaussians by the scores of the steps just taken; returns how many fewer and how many more there are for it.
     fn control_density(&mut self) -> Result<(usize, usize), MappingError> {
         if self.cloud.is_empty() {
             return Ok((0, 0));
@@ -289,31 +287,41 @@ impl Mapper {
         Ok((before - plan.keep.len() - children / 2, children / 2))
     }
 
-    /// Steps over the window until all are taken or nothing more is gained, the last of them scoring the Gaussians; returns their number and
-    /// the mean PSNR before each.
-    fn optimise(&mut self, iterations: usize, stop: &dyn Fn() -> bool) -> Result<(usize, f32), MappingError> {
+    /// Steps over the window until all are taken or nothing more is gained; on the way some of them score the Gaussians, whose density is
+    /// then controlled. Reports what it did.
+    fn optimise(&mut self, iterations: usize, stop: &dyn Fn() -> bool) -> Result<KeyframeReport, MappingError> {
         if self.cloud.is_empty() {
-            return Ok((0, 0.0));
+            return Ok(KeyframeReport::default());
         }
         let window = schedule::window(&self.keyframes, &self.config.window);
         // The scored steps are among the steps.
         let scored = self.scoring().map_or(0, |_| self.config.density.views.min(window.len()).min(iterations));
-        let mut session = Session::new(window.clone(), iterations - scored);
+        let unscored = iterations - scored;
+        let mut session = Session::new(window.clone(), unscored);
+        let due = (self.config.density.after_share * unscored as f32).round() as usize;
+        let before = self.steps_of(&mut session, due, stop)?;
+        let scored = self.score(&window)?;
+        let (pruned, grown) = self.control_density()?;
+        let after = self.steps_of(&mut session, unscored, stop)?;
+        let done = before.0 + after.0;
+        let psnr_db = (before.1 + after.1) / done.max(1) as f32;
+        Ok(KeyframeReport { pruned, grown, iterations: done + scored, psnr_db, ..KeyframeReport::default() })
+    }
+
+    /// Takes a session's steps until `end` are taken or nothing more is gained; returns their number and the sum of the PSNR before each.
+    fn steps_of(&mut self, session: &mut Session, end: usize, stop: &dyn Fn() -> bool) -> Result<(usize, f32), MappingError> {
         let (mut psnr_sum, mut done) = (0.0, 0);
-        while iterations > scored && !stop() {
+        while !session.is_over(end) && !stop() {
             let config = (&self.config.window, &self.config.skip);
-            let batch = session.next(BATCH, &self.keyframes, &mut self.rng, config);
+            let batch = session.next(BATCH.min(end - session.taken()), &self.keyframes, &mut self.rng, config);
             let reports = self.steps(&batch, None)?;
-            self.refine_poses(&window, &batch, &reports);
+            self.refine_poses(session.window(), &batch, &reports);
             psnr_sum += reports.iter().map(|r| r.loss.psnr_db()).sum::<f32>();
             done += batch.len();
             let losses: Vec<f32> = reports.iter().map(|r| r.loss.total(&self.config.loss)).collect();
-            if !session.goes_on(&batch, &losses, self.config.skip.min_gain) {
-                break;
-            }
+            session.take_note(&batch, &losses, self.config.skip.min_gain);
         }
-        let psnr_db = psnr_sum / done.max(1) as f32;
-        Ok((done + self.score(&window)?, psnr_db))
+        Ok((done, psnr_sum))
     }
 
     /// Moves the window's keyframes down the gradients of the steps; the first keyframe is the world and stays.

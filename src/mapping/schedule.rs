@@ -27,6 +27,7 @@ pub(super) struct Session {
     window: Vec<usize>,
     steps: usize,
     taken: usize,
+    converged: bool,
     /// The loss of each view at its last step of this session.
     losses: BTreeMap<usize, f32>,
 }
@@ -43,7 +44,20 @@ pub(super) struct Step {
 
 impl Session {
     pub fn new(window: Vec<usize>, steps: usize) -> Self {
-        Self { window, steps, taken: 0, losses: BTreeMap::new() }
+        Self { window, steps, taken: 0, converged: false, losses: BTreeMap::new() }
+    }
+
+    pub fn window(&self) -> &[usize] {
+        &self.window
+    }
+
+    pub fn taken(&self) -> usize {
+        self.taken
+    }
+
+    /// Whether `end` steps are taken, or more are not worth their time.
+    pub fn is_over(&self, end: usize) -> bool {
+        self.taken >= end || self.converged
     }
 
     /// The next steps, at most `count`: the window in turn, newest first, and now and then any other keyframe, so that the map does not
@@ -70,8 +84,8 @@ impl Session {
         steps
     }
 
-    /// Takes note of a batch's losses; says whether more steps are worth their time.
-    pub fn goes_on(&mut self, batch: &[Step], losses: &[f32], min_gain: f32) -> bool {
+    /// Takes note of a batch's losses; sees whether more steps are worth their time.
+    pub fn take_note(&mut self, batch: &[Step], losses: &[f32], min_gain: f32) {
         let (mut repeated, mut before, mut after) = (0, 0.0, 0.0);
         for (step, &loss) in batch.iter().zip(losses) {
             // Losses at different sizes don't compare.
@@ -82,8 +96,7 @@ impl Session {
                 after += loss;
             }
         }
-        let converged = repeated >= MIN_REPEATED && before - after < min_gain * before;
-        self.taken < self.steps && !(min_gain > 0.0 && converged)
+        self.converged = min_gain > 0.0 && repeated >= MIN_REPEATED && before - after < min_gain * before;
     }
 }
 

@@ -23,6 +23,9 @@ pub struct DensityConfig {
     pub strategy: DensityStrategy,
     /// Keyframes of the window that score the Gaussians.
     pub views: usize,
+    /// Share of a keyframe's steps after which its views score the Gaussians and the density is controlled; the rest of the steps settles
+    /// what came of that.
+    pub after_share: f32,
     /// Opacity below which a Gaussian is dropped.
     pub min_opacity: f32,
     /// Largest standard deviation, metres.
@@ -72,6 +75,7 @@ impl Default for DensityConfig {
         Self {
             strategy: DensityStrategy::default(),
             views: 4,
+            after_share: 0.6,
             min_opacity: 0.03,
             max_scale_metres: 20.0,
             vcd: VcdConfig::default(),
@@ -123,6 +127,9 @@ impl DensityConfig {
             return Err("views must be at least 1".into());
         }
         let (v, c) = (&self.vcd, &self.classic);
+        if !(0.0..=1.0).contains(&self.after_share) {
+            return Err(format!("after_share must lie between 0 and 1, not {}", self.after_share));
+        }
         let shares = [
             ("min_opacity", self.min_opacity),
             ("vcd.min_weight", v.min_weight),
