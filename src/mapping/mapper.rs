@@ -33,6 +33,8 @@ use crate::splat::{Exposure, GaussianCloud, ViewCamera};
 const FIRST_CAPACITY: usize = 32_768;
 /// Steps submitted at once: the GPU never waits for the host between them, and a stop is heeded between batches.
 const BATCH: usize = 10;
+/// Fewer where others wait for the machine.
+const YIELDING_BATCH: usize = 3;
 
 #[derive(Debug, thiserror::Error)]
 pub enum MappingError {
@@ -311,9 +313,10 @@ impl Mapper {
     /// Takes a session's steps until `end` are taken or nothing more is gained; returns their number and the sum of the PSNR before each.
     fn steps_of(&mut self, session: &mut Session, end: usize, stop: &dyn Fn() -> bool) -> Result<(usize, f32), MappingError> {
         let (mut psnr_sum, mut done) = (0.0, 0);
+        let most = if self.config.yields_to_keyframes { YIELDING_BATCH } else { BATCH };
         while !session.is_over(end) && !stop() {
             let config = (&self.config.window, &self.config.skip);
-            let batch = session.next(BATCH.min(end - session.taken()), &self.keyframes, &mut self.rng, config);
+            let batch = session.next(most.min(end - session.taken()), &self.keyframes, &mut self.rng, config);
             let reports = self.steps(&batch, None)?;
             self.refine_poses(session.window(), &batch, &reports);
             psnr_sum += reports.iter().map(|r| r.loss.psnr_db()).sum::<f32>();

@@ -7,7 +7,9 @@ use fastrand::Rng;
 use super::keyframe::MappedKeyframe;
 use super::{SkipConfig, WindowConfig};
 
-/// Views that a batch must have seen before in the same session until its gain says anything.
+/// So many steps are judged together,
+const JUDGED: usize = 10;
+/// and so many of them must be of views seen before in the same session, or their gain says nothing.
 const MIN_REPEATED: usize = 4;
 
 /// The newest keyframes and the older ones that share most landmarks with the newest, newest first; indices.
@@ -30,6 +32,17 @@ pub(super) struct Session {
     converged: bool,
     /// The loss of each view at its last step of this session.
     losses: BTreeMap<usize, f32>,
+    /// Since the last judgement.
+    gain: Gain,
+}
+
+/// How the losses of views fell that were seen twice.
+#[derive(Clone, Copy, Debug, Default)]
+struct Gain {
+    steps: usize,
+    repeated: usize,
+    before: f32,
+    after: f32,
 }
 
 /// What one step learns from.
@@ -44,7 +57,7 @@ pub(super) struct Step {
 
 impl Session {
     pub fn new(window: Vec<usize>, steps: usize) -> Self {
-        Self { window, steps, taken: 0, converged: false, losses: BTreeMap::new() }
+        Self { window, steps, taken: 0, converged: false, losses: BTreeMap::new(), gain: Gain::default() }
     }
 
     pub fn window(&self) -> &[usize] {
@@ -86,17 +99,20 @@ impl Session {
 
     /// Takes note of a batch's losses; sees whether more steps are worth their time.
     pub fn take_note(&mut self, batch: &[Step], losses: &[f32], min_gain: f32) {
-        let (mut repeated, mut before, mut after) = (0, 0.0, 0.0);
         for (step, &loss) in batch.iter().zip(losses) {
+            self.gain.steps += 1;
             // Losses at different sizes don't compare.
             let view = 2 * step.keyframe + usize::from(step.coarse);
             if let Some(last) = self.losses.insert(view, loss) {
-                repeated += 1;
-                before += last;
-                after += loss;
+                self.gain.repeated += 1;
+                self.gain.before += last;
+                self.gain.after += loss;
             }
         }
-        self.converged = min_gain > 0.0 && repeated >= MIN_REPEATED && before - after < min_gain * before;
+        if self.gain.steps >= JUDGED {
+            let Gain { repeated, before, after, .. } = std::mem::take(&mut self.gain);
+            self.converged = min_gain > 0.0 && repeated >= MIN_REPEATED && before - after < min_gain * before;
+        }
     }
 }
 

@@ -44,6 +44,8 @@ impl Budget {
                 "mapping.iterations_per_keyframe=200",
                 "mapping.window.recent=4",
                 "mapping.window.covisible=2",
+                // Few steps fit between two keyframes: those that score come first, so that none of them makes a keyframe wait.
+                "mapping.density.after_share=0",
             ],
             Self::Balanced => &[],
             Self::Quality => {

@@ -1,7 +1,9 @@
 //! Maps keyframes as they come, refines the map after the last one, and publishes a snapshot after each.
 
+use std::cell::RefCell;
+use std::collections::VecDeque;
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use crossbeam::channel::Receiver;
 
@@ -12,7 +14,13 @@ use super::{KeyframeRecord, MapperMessage, PipelineError, Progress};
 use crate::evaluation::machine;
 use crate::gpu::Gpu;
 use crate::mapping::{KeyframeReport, Mapper, MappingConfig, MappingError, RefinedPair, Refinement};
+use crate::sequence::Frame;
 use crate::splat::{GaussianCloud, MapSnapshot};
+
+/// Paced replay: the mapper pauses between two batches of steps while more frames than this wait for the tracker,
+const MOST_WAITING: usize = 2;
+/// but never longer than this.
+const LONGEST_PAUSE: Duration = Duration::from_millis(200);
 
 /// What mapping came to, also when it ended early.
 #[derive(Debug, Default)]
@@ -35,11 +43,11 @@ pub(super) struct Round<'a> {
 }
 
 /// Maps until the tracker hangs up, then refines; or until an error. `on_round` hears of each round of the refinement. With checkpoints, it
-/// goes on from the one that there is, and keeps more.
+/// goes on from the one that there is, and keeps more. `frames`, those that wait for the tracker, are given where they must not wait long.
 pub(super) fn map(
     gpu: &Arc<Gpu>,
     config: &MappingConfig,
-    messages: &Receiver<MapperMessage>,
+    (messages, frames): (&Receiver<MapperMessage>, Option<&Receiver<Frame>>),
     tracker: &Teller,
     (progress, on_round): (&Progress, &mut dyn FnMut(Round<'_>)),
     mut checkpoints: Option<Checkpoints>,
@@ -53,9 +61,13 @@ pub(super) fn map(
     let earlier_s = records.last().map_or(0.0, |record| record.done_s);
     let mut summary = MapSummary { cloud, keyframes: records, ..MapSummary::default() };
     let started = Instant::now();
-    for message in messages.iter() {
-        let (waiting, began) = (messages.len(), Instant::now());
-        let stop = || progress.stopped() || (config.yields_to_keyframes && !messages.is_empty());
+    let inbox = Inbox { messages, ahead: RefCell::default() };
+    while let Some(message) = inbox.next() {
+        let (waiting, began) = (inbox.waiting(), Instant::now());
+        let stop = || {
+            frames.into_iter().for_each(let_catch_up);
+            progress.stopped() || (config.yields_to_keyframes && inbox.keyframe_waits())
+        };
         checkpoints.iter_mut().for_each(|c| c.hear(&message));
         let done = guarded("mapping", || take(&mut mapper, message, tracker, &stop));
         match done {
@@ -93,6 +105,46 @@ pub(super) fn map(
     }
     summary.step_ms = mapper.step_times().iter().map(|t| t.as_secs_f64() * 1e3).collect();
     summary
+}
+
+/// What the tracker sent, in its order, of which the mapper may look ahead.
+struct Inbox<'a> {
+    messages: &'a Receiver<MapperMessage>,
+    /// Taken from the channel to look at: at most one keyframe and the pose updates before it.
+    ahead: RefCell<VecDeque<MapperMessage>>,
+}
+
+impl Inbox<'_> {
+    /// Waits for the next one; `None` when the tracker has hung up.
+    fn next(&self) -> Option<MapperMessage> {
+        let first = self.ahead.borrow_mut().pop_front();
+        first.or_else(|| self.messages.recv().ok())
+    }
+
+    fn waiting(&self) -> usize {
+        self.ahead.borrow().len() + self.messages.len()
+    }
+
+    /// Whether the next keyframe is here, or none will come any more.
+    fn keyframe_waits(&self) -> bool {
+        let mut ahead = self.ahead.borrow_mut();
+        let is_keyframe = |message: &MapperMessage| matches!(message, MapperMessage::Keyframe(_));
+        while !ahead.back().is_some_and(is_keyframe) {
+            match self.messages.try_recv() {
+                Ok(message) => ahead.push_back(message),
+                Err(nothing) => return nothing.is_disconnected(),
+            }
+        }
+        true
+    }
+}
+
+/// Leaves the machine to the tracker while frames wait for it; not for long, for a tracker that never catches up needs a map all the same.
+fn let_catch_up(frames: &Receiver<Frame>) {
+    let began = Instant::now();
+    while frames.len() > MOST_WAITING && began.elapsed() < LONGEST_PAUSE {
+        std::thread::sleep(Duration::from_millis(1));
+    }
 }
 
 /// The mapper to begin with, and its map: a new one, or that of a checkpoint.

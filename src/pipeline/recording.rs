@@ -95,7 +95,7 @@ impl Recording {
             paused += reached.elapsed();
         };
         let config = config.in_units(self.units_per_metre as f32);
-        let summary = map_thread::map(gpu, &config, &messages, &Teller::default(), (progress, &mut on_round), None);
+        let summary = map_thread::map(gpu, &config, (&messages, None), &Teller::default(), (progress, &mut on_round), None);
         let MapSummary { cloud, keyframes, step_ms, error, .. } = summary;
         let exposures = exposures(&self.keyframes, &keyframes);
         let mapped = Mapped { cloud, exposures, wall_s: (started.elapsed() - paused).as_secs_f64(), steps: step_ms.len() };

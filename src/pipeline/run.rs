@@ -104,6 +104,7 @@ pub fn run(
     let mut parts = checkpoints.as_ref().map_or_else(Parts::default, Checkpoints::earlier);
     let paced = config.replay.paced;
     let (frame_sender, frames) = bounded(FRAMES_AHEAD);
+    let waiting = paced.then(|| frames.clone());
     let (message_sender, messages) = bounded(MESSAGES_AHEAD);
     let (teller, listener) = measurements::channel(config);
     let mapping = &known_poses::mapping_config(sequence, config);
@@ -112,7 +113,9 @@ pub fn run(
         // A thread that cannot start drops its end of the channels, and the others end with it.
         let map = Builder::new()
             .name("mapping".into())
-            .spawn_scoped(scope, move || map_thread::map(gpu, mapping, &messages, &teller, (progress, &mut |_| ()), checkpoints))
+            .spawn_scoped(scope, move || {
+                map_thread::map(gpu, mapping, (&messages, waiting.as_ref()), &teller, (progress, &mut |_| ()), checkpoints)
+            })
             .map_err(spawn_error("mapping"))?;
         let track = Builder::new()
             .name("tracking".into())
