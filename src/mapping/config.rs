@@ -16,7 +16,8 @@ pub struct MappingConfig {
     pub iterations_per_keyframe: usize,
     /// Steps after the first keyframe, which has no map to start from.
     pub first_iterations: usize,
-    /// Whether the steps after a keyframe end as soon as the next one waits, or none will come: as many as there is time for. Such a run does not repeat.
+    /// Whether the steps after a keyframe end as soon as the next one waits, or none will come: as many as there is time for. Such a run
+    /// does not repeat.
     pub yields_to_keyframes: bool,
     /// Seed of the draws among keyframes.
     pub seed: u64,
