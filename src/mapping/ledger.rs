@@ -19,7 +19,7 @@ const MIN_TURN_RAD: f64 = 0.5 * std::f64::consts::PI / 180.0;
 pub(super) struct Entry {
     /// It moves with this keyframe.
     pub anchor: KeyframeId,
-    /// Keyframes that have been mapped since it came.
+    /// Keyframes, or rounds of a refinement, since it came.
     pub age: u32,
     /// Scored views that blended it, ever.
     pub views: u32,
@@ -48,9 +48,13 @@ impl Ledger {
         self.entries = kept.chain(parents.map(child)).collect();
     }
 
-    /// Another keyframe was mapped; `scores` are those of its scored views, if there were any.
-    pub fn keyframe_mapped(&mut self, scores: &[GaussianScore]) {
+    /// Another keyframe was mapped.
+    pub fn keyframe_mapped(&mut self) {
         self.entries.iter_mut().for_each(|entry| entry.age += 1);
+    }
+
+    /// Views were scored.
+    pub fn scored(&mut self, scores: &[GaussianScore]) {
         for (entry, score) in self.entries.iter_mut().zip(scores) {
             entry.views += score.views as u32;
             entry.best_weight = entry.best_weight.max(score.weight_max);

@@ -269,7 +269,7 @@ impl Mapper {
             Some(_) => self.optimiser.read_scores(&self.gpu, &self.cloud)?,
             None => vec![GaussianScore::default(); self.cloud.len()],
         };
-        self.ledger.keyframe_mapped(&scores);
+        self.ledger.scored(&scores);
         let [geometry, scales, rotations] = [0, 1, 2].map(|plane| self.cloud.read_plane(&self.gpu, plane));
         let (geometry, scales, rotations) = (geometry?, scales?, rotations?);
         let candidate = |i: usize| {
@@ -296,14 +296,16 @@ impl Mapper {
             return Ok(KeyframeReport::default());
         }
         let window = schedule::window(&self.keyframes, &self.config.window);
+        let density = &self.config.density;
+        let controlled = self.keyframes.len().is_multiple_of(density.every);
         // The scored steps are among the steps.
-        let scored = self.scoring().map_or(0, |_| self.config.density.views.min(window.len()).min(iterations));
+        let scored = self.scoring().filter(|_| controlled).map_or(0, |_| density.views.min(window.len()).min(iterations));
         let unscored = iterations - scored;
         let mut session = Session::new(window.clone(), unscored);
-        let due = (self.config.density.after_share * unscored as f32).round() as usize;
+        let due = (density.after_share * unscored as f32).round() as usize;
         let before = self.steps_of(&mut session, due, stop)?;
-        let scored = self.score(&window)?;
-        let (pruned, grown) = self.control_density()?;
+        self.ledger.keyframe_mapped();
+        let (scored, (pruned, grown)) = if controlled { (self.score(&window)?, self.control_density()?) } else { (0, (0, 0)) };
         let after = self.steps_of(&mut session, unscored, stop)?;
         let done = before.0 + after.0;
         let psnr_db = (before.1 + after.1) / done.max(1) as f32;

@@ -44,8 +44,12 @@ impl Budget {
                 "mapping.iterations_per_keyframe=200",
                 "mapping.window.recent=4",
                 "mapping.window.covisible=2",
-                // Few steps fit between two keyframes: those that score come first, so that none of them makes a keyframe wait.
+                // Few steps fit between two keyframes, and density control takes as long as some six of them: not after each, and where it
+                // comes it comes first, so that no keyframe waits for it.
+                "mapping.density.every=5",
                 "mapping.density.after_share=0",
+                // A tile has no steps to be skipped in.
+                "mapping.skip.tile_least=1",
             ],
             Self::Balanced => &[],
             Self::Quality => {

@@ -21,6 +21,8 @@ pub enum DensityStrategy {
 #[serde(deny_unknown_fields, default)]
 pub struct DensityConfig {
     pub strategy: DensityStrategy,
+    /// Density is controlled each time after so many keyframes.
+    pub every: usize,
     /// Keyframes of the window that score the Gaussians.
     pub views: usize,
     /// Share of a keyframe's steps after which its views score the Gaussians and the density is controlled; the rest of the steps settles
@@ -74,6 +76,7 @@ impl Default for DensityConfig {
     fn default() -> Self {
         Self {
             strategy: DensityStrategy::default(),
+            every: 1,
             views: 4,
             after_share: 0.6,
             min_opacity: 0.03,
@@ -123,8 +126,8 @@ impl DensityConfig {
 
     /// Says what is wrong with the values, if anything.
     pub fn validate(&self) -> Result<(), String> {
-        if self.views == 0 {
-            return Err("views must be at least 1".into());
+        if self.every == 0 || self.views == 0 {
+            return Err("every and views must be at least 1".into());
         }
         let (v, c) = (&self.vcd, &self.classic);
         if !(0.0..=1.0).contains(&self.after_share) {

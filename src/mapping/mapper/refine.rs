@@ -96,6 +96,7 @@ impl Mapper {
         views.rotate_left(refinement.rounds % count);
         refinement.rounds += 1;
         refinement.done += self.score(&views)?;
+        self.ledger.keyframe_mapped();
         self.control_density()
     }
 }

@@ -1,4 +1,6 @@
-//! A camera may see nothing near at first: the map begins with the first keyframe that has depth.
+//! The mapper, keyframe by keyframe.
+
+use std::sync::Arc;
 
 use image::{Rgb, RgbImage};
 use keysplat::geometry::{Pinhole, Se3};
@@ -17,15 +19,31 @@ fn keyframe(id: usize, with_depth: bool) -> Keyframe {
     Keyframe { id, world_from_camera, image, depth_source: DepthSource::Sensor, covisible: Vec::new() }
 }
 
+fn gpu() -> Option<Arc<Gpu>> {
+    Gpu::open(None).inspect_err(|error| eprintln!("SKIPPED, nothing was mapped: {error}")).ok()
+}
+
+#[test]
+fn density_is_controlled_after_every_so_many_keyframes() {
+    let Some(gpu) = gpu() else { return };
+    for every in [1, 2, 3] {
+        let mut config = MappingConfig { first_iterations: 5, iterations_per_keyframe: 5, ..Default::default() };
+        // No seed is as opaque as this.
+        (config.density.every, config.density.min_opacity) = (every, 0.95);
+        let mut mapper = Mapper::new(gpu.clone(), &config).unwrap();
+        for id in 0..6 {
+            let report = mapper.insert(&keyframe(id, true), &|| false).unwrap();
+            assert_eq!(report.iterations, 5, "{report:?}");
+            let is_controlled = (id + 1usize).is_multiple_of(every);
+            assert_eq!((report.pruned > 0, report.gaussians == 0), (is_controlled, is_controlled), "every {every}: {report:?}");
+        }
+    }
+}
+
+/// A camera may see nothing near at first: the map begins with the first keyframe that has depth.
 #[test]
 fn keyframes_before_the_first_depth_are_passed_over() {
-    let gpu = match Gpu::open(None) {
-        Ok(gpu) => gpu,
-        Err(error) => {
-            eprintln!("SKIPPED, nothing was mapped: {error}");
-            return;
-        }
-    };
+    let Some(gpu) = gpu() else { return };
     let config = MappingConfig { first_iterations: 5, iterations_per_keyframe: 5, ..Default::default() };
     let mut mapper = Mapper::new(gpu.clone(), &config).unwrap();
     for id in 0..2 {
