@@ -24,7 +24,7 @@ const MIN_STEPS: i32 = 8;
 ///
 /// Off: in the few steps that a live map gets, refined poses come out only little truer than the tracker's from one keyframe to the next
 /// (1.64 against 1.81 mm, 0.55 against 0.65 mrad, on a room with noise and blur, mapped at a quarter of its size), and drift as a whole.
-/// Neither ATE nor held-out images gain (-0.2 dB).
+/// Held-out images gain what working on all tiles gives them, and no more.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RefinePosesConfig {
@@ -41,7 +41,8 @@ pub struct RefinePosesConfig {
     pub max_shift_metres: f64,
     /// Standard deviation of a refined relative pose, in pixels of the mapped image at the keyframe's median depth. On a synthetic room
     /// the refined poses are truer than that, by 0.07 pixels, but most of this is the tracker's own say coming back: at 0.1 it holds the
-    /// tracker from bettering itself (ATE +9%), at 0.3 hardly, at 1 not at all.
+    /// tracker from bettering itself (ATE +9%). On RedKitchen, whose 600 frames give small biases time to add up, 0.5 raises the ATE by 8
+    /// to 11%, 1 by 0 to 8%, and 2 leaves it (0.552 cm in three runs, as without) with steps from frame to frame as true or up to 11% truer.
     pub sigma_pixels: f64,
 }
 
@@ -55,7 +56,7 @@ impl Default for RefinePosesConfig {
             pull: 0.05,
             max_turn_rad: 0.01,
             max_shift_metres: 0.02,
-            sigma_pixels: 0.5,
+            sigma_pixels: 2.0,
         }
     }
 }

@@ -255,7 +255,11 @@ impl Rasterizer {
     /// Grows the pair buffers to what the counters of a view ask for.
     pub fn make_room(&mut self, counters: &[Counter]) -> Result<(), GpuError> {
         let needed = counters[PAIR_COUNTER as usize].needed as usize;
-        if needed > self.workspace.pair_capacity { self.workspace.reserve_pairs(&self.gpu, needed) } else { Ok(()) }
+        if needed > self.workspace.pair_capacity {
+            tracing::debug!(pairs = needed, "making room for pairs");
+            self.workspace.reserve_pairs(&self.gpu, needed)?;
+        }
+        Ok(())
     }
 
     /// Renders a view and reads it back.
