@@ -19,7 +19,7 @@ pub enum Budget {
     Realtime,
     /// The defaults.
     Balanced,
-    /// Finer seeds, and no tile left out.
+    /// Finer seeds, more steps, and no tile left out.
     Quality,
 }
 
@@ -52,8 +52,13 @@ impl Budget {
                 "mapping.skip.tile_least=1",
             ],
             Self::Balanced => &[],
-            // More steps than the defaults' gain less than all tiles in as many.
-            Self::Quality => &["mapping.skip.tile_least=1", "mapping.seeding.detail=0.04", "mapping.density.vcd.min_worth=0.5"],
+            // All tiles gain more than the steps do that take as long.
+            Self::Quality => &[
+                "mapping.iterations_per_keyframe=40",
+                "mapping.skip.tile_least=1",
+                "mapping.seeding.detail=0.04",
+                "mapping.density.vcd.min_worth=0.5",
+            ],
         }
     }
 
