@@ -170,11 +170,12 @@ impl GpuCloud {
             planes.write(gpu, 0, &means);
             planes.write(gpu, 2 * self.capacity, &rotations);
         }
-        for (run, _) in runs {
-            let zeros = vec![[0.0f32; 4]; run.len()];
+        // A plane at a time: runs can be many thousands, and each write has its own staging memory.
+        for moments in [&self.moments_1, &self.moments_2] {
             for plane in 0..self.planes() {
-                self.moments_1.write(gpu, plane * self.capacity + run.start, &zeros);
-                self.moments_2.write(gpu, plane * self.capacity + run.start, &zeros);
+                let mut values: Vec<[f32; 4]> = moments.read(gpu, plane * self.capacity, self.count)?;
+                runs.iter().for_each(|(run, _)| values[run.clone()].fill([0.0; 4]));
+                moments.write(gpu, plane * self.capacity, &values);
             }
         }
         Ok(())
