@@ -48,7 +48,7 @@ impl Budget {
                 // comes it comes first, so that no keyframe waits for it.
                 "mapping.density.every=5",
                 "mapping.density.after_share=0",
-                // A tile has no steps to be skipped in.
+                // In so few steps a tile left out of one is hardly seen again.
                 "mapping.skip.tile_least=1",
             ],
             Self::Balanced => &[],
