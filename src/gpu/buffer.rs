@@ -92,5 +92,7 @@ impl GpuBuffer {
 impl Drop for GpuBuffer {
     fn drop(&mut self) {
         self.memory.remove(self.raw.size());
+        // Not when the last bind group over it goes: kernels keep theirs until they need another.
+        self.raw.destroy();
     }
 }

@@ -42,12 +42,11 @@ impl LimitsConfig {
         self.max_gaussians.is_some() || self.max_gpu_bytes.is_some()
     }
 
-    /// The most Gaussians, of `bytes_each` in the map, when buffers that don't depend on their number take `other_bytes`. A map is copied
-    /// when it changes, so its bytes count twice.
+    /// The most Gaussians, of `bytes_each` in the map, when buffers that don't depend on their number take `other_bytes`.
     pub(super) fn gaussians(&self, bytes_each: u64, other_bytes: u64) -> usize {
         let by_memory = self
             .max_gpu_bytes
-            .map_or(usize::MAX, |limit| (limit.saturating_sub(other_bytes) / (2 * bytes_each + SCRATCH_BYTES_EACH)) as usize);
+            .map_or(usize::MAX, |limit| (limit.saturating_sub(other_bytes) / (bytes_each + SCRATCH_BYTES_EACH)) as usize);
         self.max_gaussians.unwrap_or(usize::MAX).min(by_memory).max(LEAST_GAUSSIANS)
     }
 

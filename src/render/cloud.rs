@@ -29,6 +29,8 @@ pub struct GpuCloud {
     moments_2: GpuBuffer,
     /// What the parameters were over each Gaussian's last steps, on average.
     averages: GpuBuffer,
+    /// As large as the others; a change gathers one of them into it, the next into that one, and so on, so that it needs no memory.
+    spare: GpuBuffer,
     gather: Kernel,
 }
 
@@ -46,9 +48,19 @@ impl GpuCloud {
     /// An empty map with room for `capacity` Gaussians; it grows as needed.
     pub fn new(gpu: &Gpu, sh_degree: ShDegree, capacity: usize) -> Result<Self, GpuError> {
         let capacity = capacity.max(256);
-        let [parameters, moments_1, moments_2, averages] = allocate(gpu, sh_degree, capacity)?;
-        let gather = Kernel::new(gpu, "gather", "main", &shaders::GATHER.text(BlendForm::default()));
-        Ok(Self { sh_degree, count: 0, capacity, limit: None, parameters, moments_1, moments_2, averages, gather })
+        let planes = || allocate(gpu, sh_degree, capacity);
+        Ok(Self {
+            sh_degree,
+            count: 0,
+            capacity,
+            limit: None,
+            parameters: planes()?,
+            moments_1: planes()?,
+            moments_2: planes()?,
+            averages: planes()?,
+            spare: planes()?,
+            gather: Kernel::new(gpu, "gather", "main", &shaders::GATHER.text(BlendForm::default())),
+        })
     }
 
     pub fn len(&self) -> usize {
@@ -67,9 +79,9 @@ impl GpuCloud {
         self.sh_degree
     }
 
-    /// Bytes of each Gaussian: parameters, two moments and averages.
+    /// Bytes of each Gaussian: parameters, two moments, averages, and a spare for changes.
     pub fn bytes_each(&self) -> u64 {
-        (BUFFERS * self.planes() * 16) as u64
+        ((BUFFERS + 1) * self.planes() * 16) as u64
     }
 
     /// Buffers are made for at most `limit` Gaussians from now on; whoever appends must keep to it.
@@ -181,8 +193,9 @@ impl GpuCloud {
         Ok(())
     }
 
+    /// The Gaussians at `chosen`, in this order, with room for `capacity`. All buffers have the new size, but for the old one that is
+    /// gathered from, so the two never stand beside each other in full.
     fn rebuild(&mut self, gpu: &Gpu, chosen: &[u32], capacity: usize) -> Result<(), GpuError> {
-        let [parameters, moments_1, moments_2, averages] = allocate(gpu, self.sh_degree, capacity)?;
         let list = GpuBuffer::storage(gpu, "chosen", (chosen.len() * 4) as u64)?;
         list.write(gpu, 0, chosen);
         let setup = GatherSetup {
@@ -192,17 +205,23 @@ impl GpuCloud {
             capacity_out: capacity as u32,
         };
         let setup = GpuBuffer::uniform(gpu, "gather setup", &setup)?;
-        let mut encoder = gpu.device.create_command_encoder(&Default::default());
-        {
-            let mut pass = encoder.begin_compute_pass(&Default::default());
-            let size = workgroups((chosen.len() as u32).div_ceil(256));
-            let moved = [&parameters, &moments_1, &moments_2, &averages];
-            for (from, to) in self.buffers().into_iter().zip(moved) {
-                self.gather.dispatch(gpu, &mut pass, &[(0, &setup), (1, &list), (2, from), (3, to)], size);
+        let size = workgroups((chosen.len() as u32).div_ceil(256));
+        let Self { parameters, moments_1, moments_2, averages, spare, gather, .. } = self;
+        for buffer in [parameters, moments_1, moments_2, averages] {
+            if capacity != self.capacity {
+                *spare = allocate(gpu, self.sh_degree, capacity)?;
+                gpu.wait()?;
             }
+            let mut encoder = gpu.device.create_command_encoder(&Default::default());
+            let mut pass = encoder.begin_compute_pass(&Default::default());
+            gather.dispatch(gpu, &mut pass, &[(0, &setup), (1, &list), (2, buffer), (3, spare)], size);
+            drop(pass);
+            gpu.queue.submit([encoder.finish()]);
+            std::mem::swap(buffer, spare);
         }
-        gpu.queue.submit([encoder.finish()]);
-        (self.parameters, self.moments_1, self.moments_2, self.averages) = (parameters, moments_1, moments_2, averages);
+        if capacity != self.capacity {
+            *spare = allocate(gpu, self.sh_degree, capacity)?;
+        }
         (self.count, self.capacity) = (chosen.len(), capacity);
         Ok(())
     }
@@ -286,12 +305,6 @@ fn is_finite(cloud: &GaussianCloud, i: usize) -> bool {
     (0..planes(cloud.sh_degree)).all(|plane| plane_value(cloud, plane, i).iter().all(|v| v.is_finite()))
 }
 
-fn allocate(gpu: &Gpu, sh_degree: ShDegree, capacity: usize) -> Result<[GpuBuffer; BUFFERS], GpuError> {
-    let bytes = (planes(sh_degree) * capacity * 16) as u64;
-    Ok([
-        GpuBuffer::storage(gpu, "Gaussian parameters", bytes)?,
-        GpuBuffer::storage(gpu, "first moments", bytes)?,
-        GpuBuffer::storage(gpu, "second moments", bytes)?,
-        GpuBuffer::storage(gpu, "averaged parameters", bytes)?,
-    ])
+fn allocate(gpu: &Gpu, sh_degree: ShDegree, capacity: usize) -> Result<GpuBuffer, GpuError> {
+    GpuBuffer::storage(gpu, "Gaussians", (planes(sh_degree) * capacity * 16) as u64)
 }
