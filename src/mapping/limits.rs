@@ -117,9 +117,9 @@ mod tests {
     fn memory_is_shared_by_images_and_gaussians() {
         let limits = LimitsConfig { max_gpu_bytes: Some(100_000_000), ..LimitsConfig::default() };
         assert_eq!(limits.keyframes(1_000_000), 40);
-        let most = limits.gaussians(336, 40_000_000);
+        let most = limits.gaussians(672, 40_000_000);
         assert!((76_000..77_000).contains(&most), "{most}");
-        assert_eq!(LimitsConfig { max_gaussians: Some(5000), ..limits }.gaussians(336, 0), 5000);
+        assert_eq!(LimitsConfig { max_gaussians: Some(5000), ..limits }.gaussians(672, 0), 5000);
         assert!(LimitsConfig { max_gaussians: Some(5), ..LimitsConfig::default() }.validate().is_err());
     }
 }
