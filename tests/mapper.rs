@@ -40,6 +40,27 @@ fn density_is_controlled_after_every_so_many_keyframes() {
     }
 }
 
+/// Each keyframe shows another place, so there is always more to seed.
+#[test]
+fn memory_is_held_however_much_there_is_to_map() {
+    let Some(free) = gpu() else { return };
+    let steps = MappingConfig { first_iterations: 5, iterations_per_keyframe: 5, ..Default::default() };
+    let elsewhere = |id| Keyframe { world_from_camera: Se3::translation(5.0 * id as f64, 0.0, 0.0), ..keyframe(id, true) };
+    let walk = |gpu: &Arc<Gpu>, config: &MappingConfig| -> Vec<usize> {
+        let mut mapper = Mapper::new(gpu.clone(), config).unwrap();
+        (0..40).map(|id| mapper.insert(&elsewhere(id), &|| false).unwrap().gaussians).collect()
+    };
+    let unbounded = walk(&free, &steps);
+    let limit = free.peak_bytes() * 3 / 5;
+    let mut config = steps.clone();
+    config.limits.max_gpu_bytes = Some(limit);
+    let Some(bounded) = gpu() else { return };
+    let held = walk(&bounded, &config);
+    assert!(bounded.peak_bytes() <= limit, "{} of {limit} bytes", bounded.peak_bytes());
+    assert_eq!(held[..10], unbounded[..10], "as long as there is room, the limit changes nothing");
+    assert!(held[39] > 1000 && held[39] < unbounded[39], "{held:?}, {unbounded:?}");
+}
+
 /// A camera may see nothing near at first: the map begins with the first keyframe that has depth.
 #[test]
 fn keyframes_before_the_first_depth_are_passed_over() {

@@ -30,7 +30,7 @@ use crate::render::{GpuCloud, Rasterizer, Rendered};
 use crate::sequence::{KnownPoint, RectifiedImage};
 use crate::splat::{Exposure, GaussianCloud, ViewCamera};
 
-const FIRST_CAPACITY: usize = 32_768;
+const FIRST_CAPACITY: usize = 4096;
 /// Steps submitted at once: the GPU never waits for the host between them, and a stop is heeded between batches.
 const BATCH: usize = 10;
 /// Fewer where others wait for the machine.
@@ -109,10 +109,10 @@ impl Mapper {
         if exposure != Exposure::default() {
             keyframe.to_mut().image.color = exposure::corrected(&keyframe.image.color, &exposure);
         }
-        let seeded = self.seed(&keyframe, rendered.as_ref())?;
         let mapped = MappedKeyframe::new(&self.gpu, &keyframe, exposure, self.config.learns_at_half_size())?;
         self.keyframes.push(mapped);
         self.limit_keyframes();
+        let seeded = self.seed(&keyframe, rendered.as_ref())?;
         let first = self.keyframes.len() == 1;
         let iterations = if first { self.config.first_iterations } else { self.config.iterations_per_keyframe };
         if iterations == 0 {
@@ -238,8 +238,9 @@ impl Mapper {
 
     /// How many Gaussians there may be, at present.
     fn most_gaussians(&self) -> usize {
-        let each = self.cloud.bytes_each();
-        self.config.limits.gaussians(each, LimitsConfig::other_bytes(self.gpu.bytes(), each, self.cloud.capacity()))
+        let next_image = self.keyframes.last().map_or(0, MappedKeyframe::image_bytes);
+        let other = LimitsConfig::other_bytes(self.gpu.bytes() + next_image, self.cloud.bytes(), self.cloud.capacity());
+        self.config.limits.gaussians(self.cloud.bytes_each(), other)
     }
 
     /// Keyframes beyond their number give their images back.

@@ -67,8 +67,14 @@ impl Scores {
 
     /// Room for so many Gaussians, zeroed.
     pub fn reserve(&mut self, gpu: &Gpu, capacity: usize) -> Result<(), GpuError> {
-        self.capacity = capacity;
+        if capacity == self.capacity {
+            let mut encoder = gpu.device.create_command_encoder(&Default::default());
+            encoder.clear_buffer(self.scores.raw(), 0, None);
+            gpu.queue.submit([encoder.finish()]);
+            return Ok(());
+        }
         self.scores = GpuBuffer::storage(gpu, "scores", capacity as u64 * 32)?;
+        self.capacity = capacity;
         Ok(())
     }
 

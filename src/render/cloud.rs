@@ -29,8 +29,8 @@ pub struct GpuCloud {
     moments_2: GpuBuffer,
     /// What the parameters were over each Gaussian's last steps, on average.
     averages: GpuBuffer,
-    /// As large as the others; a change gathers one of them into it, the next into that one, and so on, so that it needs no memory.
-    spare: GpuBuffer,
+    /// As large as the others: a change gathers one of them into it, the next into that one, and so on, so that it needs no memory.
+    spare: Option<GpuBuffer>,
     gather: Kernel,
 }
 
@@ -58,7 +58,7 @@ impl GpuCloud {
             moments_1: planes()?,
             moments_2: planes()?,
             averages: planes()?,
-            spare: planes()?,
+            spare: None,
             gather: Kernel::new(gpu, "gather", "main", &shaders::GATHER.text(BlendForm::default())),
         })
     }
@@ -79,9 +79,14 @@ impl GpuCloud {
         self.sh_degree
     }
 
-    /// Bytes of each Gaussian: parameters, two moments, averages, and a spare for changes.
+    /// Bytes that there is to be room for with each Gaussian: parameters, two moments, averages, and a spare for changes.
     pub fn bytes_each(&self) -> u64 {
         ((BUFFERS + 1) * self.planes() * 16) as u64
+    }
+
+    /// Bytes that it has at present.
+    pub fn bytes(&self) -> u64 {
+        self.buffers().into_iter().chain(&self.spare).map(|buffer| buffer.raw().size()).sum()
     }
 
     /// Buffers are made for at most `limit` Gaussians from now on; whoever appends must keep to it.
@@ -136,11 +141,12 @@ impl GpuCloud {
     /// Keeps the Gaussians at `keep` (ascending indices) and appends a copy of each of `parents` with its own position, raw opacity and log
     /// scale (planes 0 and 1). All keep their moments: a child goes on at its parent's pace.
     pub fn change(&mut self, gpu: &Gpu, keep: &[u32], (parents, geometry): (&[u32], &[[[f32; 4]; 2]])) -> Result<(), GpuError> {
-        if keep.len() == self.count && parents.is_empty() {
+        let sources: Vec<u32> = keep.iter().chain(parents).copied().collect();
+        let capacity = self.capacity_for(gpu, sources.len());
+        if keep.len() == self.count && parents.is_empty() && capacity == self.capacity {
             return Ok(());
         }
-        let sources: Vec<u32> = keep.iter().chain(parents).copied().collect();
-        self.rebuild(gpu, &sources, self.capacity_for(gpu, sources.len()))?;
+        self.rebuild(gpu, &sources, capacity)?;
         for plane in 0..2 {
             let values: Vec<[f32; 4]> = geometry.iter().map(|g| g[plane]).collect();
             self.parameters.write(gpu, plane * self.capacity + keep.len(), &values);
@@ -193,8 +199,8 @@ impl GpuCloud {
         Ok(())
     }
 
-    /// The Gaussians at `chosen`, in this order, with room for `capacity`. All buffers have the new size, but for the old one that is
-    /// gathered from, so the two never stand beside each other in full.
+    /// The Gaussians at `chosen`, in this order, with room for `capacity`. Buffers are replaced one at a time: the old and the new ones never
+    /// stand beside each other in full.
     fn rebuild(&mut self, gpu: &Gpu, chosen: &[u32], capacity: usize) -> Result<(), GpuError> {
         let list = GpuBuffer::storage(gpu, "chosen", (chosen.len() * 4) as u64)?;
         list.write(gpu, 0, chosen);
@@ -206,21 +212,23 @@ impl GpuCloud {
         };
         let setup = GpuBuffer::uniform(gpu, "gather setup", &setup)?;
         let size = workgroups((chosen.len() as u32).div_ceil(256));
+        let (sh_degree, resized) = (self.sh_degree, capacity != self.capacity);
         let Self { parameters, moments_1, moments_2, averages, spare, gather, .. } = self;
         for buffer in [parameters, moments_1, moments_2, averages] {
-            if capacity != self.capacity {
-                *spare = allocate(gpu, self.sh_degree, capacity)?;
-                gpu.wait()?;
-            }
+            // An old one of another size is given back before the new one is made.
+            let to = match spare.take().filter(|_| !resized) {
+                Some(spare) => spare,
+                None => allocate(gpu, sh_degree, capacity)?,
+            };
             let mut encoder = gpu.device.create_command_encoder(&Default::default());
             let mut pass = encoder.begin_compute_pass(&Default::default());
-            gather.dispatch(gpu, &mut pass, &[(0, &setup), (1, &list), (2, buffer), (3, spare)], size);
+            gather.dispatch(gpu, &mut pass, &[(0, &setup), (1, &list), (2, buffer), (3, &to)], size);
             drop(pass);
             gpu.queue.submit([encoder.finish()]);
-            std::mem::swap(buffer, spare);
+            *spare = Some(std::mem::replace(buffer, to));
         }
-        if capacity != self.capacity {
-            *spare = allocate(gpu, self.sh_degree, capacity)?;
+        if resized {
+            *spare = None;
         }
         (self.count, self.capacity) = (chosen.len(), capacity);
         Ok(())
