@@ -82,6 +82,7 @@ impl LoopCloser {
         let Some(recognised) = recognised else { return Vec::new() };
         let scale_is_free = search.scale_is_free;
         self.last = Some(keyframe);
+        tracing::info!(keyframe, place = recognised.place, landmarks = recognised.matches.len(), "loop closed");
         loop_correction::correct(map, &recognised, &mut self.edges, scale_is_free, pinhole, config)
     }
 }
