@@ -143,7 +143,7 @@ fn what_the_tracker_was_told_and_what_memory_allows_comes_again() {
         return;
     }
     let settings = ["tracking.keyframe_translation=0.005", "mapping.refine_poses.enabled=true", "mapping.limits.max_keyframes=8"];
-    let more: Vec<&str> = settings.iter().flat_map(|s| ["--set", s]).chain(["--max-gpu-memory", "20M"]).collect();
+    let more: Vec<&str> = settings.iter().flat_map(|s| ["--set", s]).chain(["--max-gpu-memory", "18M"]).collect();
     survives("told", recording(), &more, 11);
     let whole = metrics(&scratch().join("told-whole"));
     assert!(whole.keyframes > Some(12) && whole.gaussians < Some(4000), "neither limit matters: {whole}");
