@@ -30,6 +30,7 @@ use crate::render::{GpuCloud, Rasterizer, Rendered};
 use crate::sequence::{KnownPoint, RectifiedImage};
 use crate::splat::{Exposure, GaussianCloud, ViewCamera};
 
+/// Gaussians that there is room for at first; the map's buffers grow with it.
 const FIRST_CAPACITY: usize = 4096;
 /// Steps submitted at once: the GPU never waits for the host between them, and a stop is heeded between batches.
 const BATCH: usize = 10;
@@ -109,6 +110,7 @@ impl Mapper {
         if exposure != Exposure::default() {
             keyframe.to_mut().image.color = exposure::corrected(&keyframe.image.color, &exposure);
         }
+        // Before its seeds: a bound on memory leaves these what the image has left.
         let mapped = MappedKeyframe::new(&self.gpu, &keyframe, exposure, self.config.learns_at_half_size())?;
         self.keyframes.push(mapped);
         self.limit_keyframes();
@@ -236,7 +238,7 @@ impl Mapper {
         Ok(seeds.len())
     }
 
-    /// How many Gaussians there may be, at present.
+    /// How many Gaussians there may be, at present, when there is to be room for one more keyframe's image.
     fn most_gaussians(&self) -> usize {
         let next_image = self.keyframes.last().map_or(0, MappedKeyframe::image_bytes);
         let other = LimitsConfig::other_bytes(self.gpu.bytes() + next_image, self.cloud.bytes(), self.cloud.capacity());

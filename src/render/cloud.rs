@@ -188,14 +188,16 @@ impl GpuCloud {
             planes.write(gpu, 0, &means);
             planes.write(gpu, 2 * self.capacity, &rotations);
         }
-        // A plane at a time: runs can be many thousands, and each write has its own staging memory.
-        for moments in [&self.moments_1, &self.moments_2] {
+        let mut encoder = gpu.device.create_command_encoder(&Default::default());
+        for (run, _) in runs {
             for plane in 0..self.planes() {
-                let mut values: Vec<[f32; 4]> = moments.read(gpu, plane * self.capacity, self.count)?;
-                runs.iter().for_each(|(run, _)| values[run.clone()].fill([0.0; 4]));
-                moments.write(gpu, plane * self.capacity, &values);
+                let (from, bytes) = ((plane * self.capacity + run.start) * 16, run.len() * 16);
+                for moments in [&self.moments_1, &self.moments_2] {
+                    encoder.clear_buffer(moments.raw(), from as u64, Some(bytes as u64));
+                }
             }
         }
+        gpu.queue.submit([encoder.finish()]);
         Ok(())
     }
 
