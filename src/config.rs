@@ -114,6 +114,12 @@ fn overlay(under: &mut toml::Table, over: toml::Table) {
 }
 
 impl Config {
+    /// The defaults, for a recording's folder or video.
+    pub fn for_recording(path: &Path) -> Self {
+        let path = std::path::absolute(path).unwrap_or_else(|_| path.into());
+        Self { sequence: Some(SequenceConfig { path, ..SequenceConfig::default() }), ..Self::default() }
+    }
+
     /// The defaults for recordings whose poses are known.
     pub fn offline() -> Self {
         let replay = ReplayConfig { known_poses: true, ..ReplayConfig::default() };

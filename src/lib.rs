@@ -1,19 +1,36 @@
-//! Online Gaussian-splat SLAM: replays a recorded image sequence and produces a camera trajectory, a photorealistic Gaussian
-//! map and honest figures about both. `ARCHITECTURE.md` draws the whole; `CONVENTIONS.md` says what names, frames and units mean.
+//! Online Gaussian-splat SLAM: replays a recorded image sequence into a camera trajectory, a Gaussian map and accuracy metrics.
+//!
+//! A [`Session`] is the one entry to a run: open, run, write, measure. Its example maps a synthetic recording; real ones differ in their path
+//! alone. The modules below it are public for programs that track, map, render or evaluate by themselves. `ARCHITECTURE.md` draws the whole,
+//! `CONVENTIONS.md` defines frames, units and names.
 
 pub mod bench;
 pub mod config;
 pub mod evaluation;
 pub mod export;
+pub mod files;
 pub mod geometry;
 pub mod gpu;
 pub mod mapping;
 pub mod optimise;
 pub mod pipeline;
-pub mod reference;
+pub mod presets;
+pub mod recording;
 pub mod render;
 pub mod report;
+pub mod run_folder;
 pub mod sequence;
+pub mod session;
 pub mod splat;
-pub mod stress;
+pub mod synthetic;
 pub mod tracking;
+pub mod verification;
+
+pub use config::Config;
+pub use evaluation::Metrics;
+pub use gpu::Gpu;
+pub use pipeline::Progress;
+pub use presets::Preset;
+pub use recording::Recording;
+pub use session::{Session, SessionError};
+pub use synthetic::SceneConfig;

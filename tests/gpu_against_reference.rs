@@ -8,13 +8,13 @@ use image::RgbImage;
 use keysplat::geometry::Pinhole;
 use keysplat::gpu::Gpu;
 use keysplat::optimise::{AdamConfig, LossConfig, Optimiser, TargetImage, TrainingView};
-use keysplat::reference::adam::Adam64;
-use keysplat::reference::loss::{LossWeights, Target64, loss};
-use keysplat::reference::project_backward::backward;
-use keysplat::reference::{Cutoffs, Gaussian64, Image64, View64, cloud64, rasterize_forward};
 use keysplat::render::{BlendForm, GpuCloud, Rasterizer};
 use keysplat::splat::ViewCamera;
 use keysplat::splat::{GaussianCloud, ShDegree};
+use keysplat::verification::reference::adam::Adam64;
+use keysplat::verification::reference::loss::{LossWeights, Target64, loss};
+use keysplat::verification::reference::project_backward::backward;
+use keysplat::verification::reference::{Cutoffs, Gaussian64, Image64, View64, cloud64, rasterize_forward};
 use nalgebra::Vector3;
 use std::sync::Arc;
 

@@ -6,35 +6,35 @@ use std::time::Duration;
 
 use common::recording::{ITERATIONS_PER_KEYFRAME, recording, scratch, skipped_without_adapter};
 use fastrand::Rng;
-use keysplat::config::Config;
 use keysplat::export::MapFormat;
 use keysplat::gpu::{Gpu, GpuError};
 use keysplat::mapping::MappingError;
-use keysplat::pipeline::{self, Outcome, PipelineError, Progress, outputs};
+use keysplat::pipeline::{self, PipelineError, Progress, Replay};
 use keysplat::render::{GpuCloud, Rasterizer};
-use keysplat::sequence::Sequence;
+use keysplat::run_folder::outputs;
 use keysplat::splat::ShDegree;
+use keysplat::{Config, Recording};
 
-fn config() -> Config {
-    let mut config = Config::default();
+fn few_steps() -> Recording {
+    let mut config = Config::for_recording(recording());
     config.mapping.iterations_per_keyframe = ITERATIONS_PER_KEYFRAME as usize;
-    config
+    Recording::open(config).unwrap()
 }
 
-fn gpu_error(outcome: &Outcome) -> &GpuError {
-    match &outcome.error {
+fn gpu_error(replay: &Replay) -> &GpuError {
+    match &replay.error {
         Some(PipelineError::Mapping(MappingError::Gpu(error))) => error,
         other => panic!("no GPU error: {other:?}"),
     }
 }
 
-/// Writes the outcome as the program does, and reads the map back.
-fn assert_written(name: &str, outcome: &Outcome) {
-    assert!(!outcome.cloud.is_empty(), "the map of the keyframes before the failure is kept");
+/// Writes the result as the program does, and reads the map back.
+fn assert_written(name: &str, recording: &Recording, Replay { result, .. }: &Replay) {
+    assert!(!result.cloud.is_empty(), "the map of the keyframes before the failure is kept");
     let out = scratch().join(name);
     let _lock = outputs::prepare_folder(&out).unwrap();
-    outputs::write_results(&out, outcome, &config()).unwrap();
-    assert_eq!(MapFormat::Ply.read(&out.join(outputs::MAP)).unwrap().len(), outcome.cloud.len());
+    outputs::write_results(&out, recording, result).unwrap();
+    assert_eq!(MapFormat::Ply.read(&out.join(outputs::MAP)).unwrap().len(), result.cloud.len());
 }
 
 #[test]
@@ -42,10 +42,10 @@ fn a_lost_device_ends_the_run_with_what_was_mapped() {
     if skipped_without_adapter() {
         return;
     }
-    let sequence = Sequence::open(recording(), None, None).unwrap();
+    let recording = few_steps();
     let gpu = Gpu::open(None).unwrap();
     let progress = Progress::default();
-    let outcome = std::thread::scope(|scope| {
+    let replay = std::thread::scope(|scope| {
         let (gpu, progress) = (&gpu, &progress);
         scope.spawn(move || {
             while progress.mapping.pop().is_none() {
@@ -53,10 +53,10 @@ fn a_lost_device_ends_the_run_with_what_was_mapped() {
             }
             gpu.device.destroy();
         });
-        pipeline::run(&sequence, gpu, &config(), progress, None).unwrap()
+        pipeline::run(&recording, gpu, progress, None).unwrap()
     });
-    assert!(matches!(gpu_error(&outcome), GpuError::Failed(_)), "{:?}", outcome.error);
-    assert_written("lost-device", &outcome);
+    assert!(matches!(gpu_error(&replay), GpuError::Failed(_)), "{:?}", replay.error);
+    assert_written("lost-device", &recording, &replay);
 }
 
 /// What does not fit is refused by name and size, and what there was goes on working.

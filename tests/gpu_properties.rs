@@ -8,11 +8,11 @@ use std::sync::{Arc, Mutex, OnceLock};
 use fastrand::Rng;
 use keysplat::gpu::Gpu;
 use keysplat::optimise::Optimiser;
-use keysplat::reference::project_backward::backward;
-use keysplat::reference::rasterize_forward::Conditioning;
-use keysplat::reference::{Cutoffs, Gaussian64, View64, cloud64, rasterize_forward};
 use keysplat::render::{BlendForm, GpuCloud, Rasterizer};
 use keysplat::splat::{Gaussian, GaussianCloud, ShDegree};
+use keysplat::verification::reference::project_backward::backward;
+use keysplat::verification::reference::rasterize_forward::Conditioning;
+use keysplat::verification::reference::{Cutoffs, Gaussian64, View64, cloud64, rasterize_forward};
 use nalgebra::Vector3;
 use proptest::prelude::*;
 

@@ -6,11 +6,11 @@ use fastrand::Rng;
 use image::{Rgb, RgbImage};
 use keysplat::gpu::Gpu;
 use keysplat::optimise::{AdamConfig, LossConfig, Optimiser, TargetImage, TrainingView, WrongPixels};
-use keysplat::reference::loss::{LossWeights, Target64, loss};
-use keysplat::reference::scores::scores;
-use keysplat::reference::{Cutoffs, View64, cloud64, rasterize_forward};
 use keysplat::render::{BlendForm, GpuCloud, Rasterizer};
 use keysplat::splat::ShDegree;
+use keysplat::verification::reference::loss::{LossWeights, Target64, loss};
+use keysplat::verification::reference::scores::scores;
+use keysplat::verification::reference::{Cutoffs, View64, cloud64, rasterize_forward};
 use nalgebra::Vector3;
 
 const TOLERANCE: f64 = 1e-3;

@@ -10,7 +10,7 @@ use keysplat::config::Config;
 use keysplat::export::ply;
 use keysplat::geometry::Trajectory;
 use keysplat::sequence::Layout;
-use keysplat::sequence::synthetic::SceneConfig;
+use keysplat::synthetic::SceneConfig;
 
 /// Counts the bytes in use, and the most that ever were.
 struct Counting;

@@ -9,8 +9,8 @@ use common::recording::{finish, keysplat, metrics, run_command, scene, scratch, 
 use image::RgbImage;
 use keysplat::config::Config;
 use keysplat::geometry::Se3;
-use keysplat::sequence::synthetic::{self, CameraConfig, SceneConfig};
 use keysplat::sequence::{Layout, Sensor, Sequence};
+use keysplat::synthetic::{self, CameraConfig, SceneConfig};
 use nalgebra::Point3;
 use opencv::core::{Mat, MatTraitConst, Size};
 use opencv::videoio::{VideoWriter, VideoWriterTrait};

@@ -5,11 +5,11 @@ mod common;
 
 use fastrand::Rng;
 use keysplat::geometry::se3;
-use keysplat::reference::loss::{LossWeights, Target64, loss};
-use keysplat::reference::project_backward::backward;
-use keysplat::reference::rasterize_forward::render;
-use keysplat::reference::{Cutoffs, Gaussian64, Image64, View64, cloud64};
 use keysplat::splat::ShDegree;
+use keysplat::verification::reference::loss::{LossWeights, Target64, loss};
+use keysplat::verification::reference::project_backward::backward;
+use keysplat::verification::reference::rasterize_forward::render;
+use keysplat::verification::reference::{Cutoffs, Gaussian64, Image64, View64, cloud64};
 use nalgebra::{Vector3, Vector6};
 
 const STEP: f64 = 1e-6;

@@ -1,6 +1,6 @@
 //! What the stress suite and the fuzzers found, one test each, with a sentence of what it was.
 
-use keysplat::stress::{self, CaseId, Part, StressConfig};
+use keysplat::verification::stress::{self, CaseId, Part, StressConfig};
 
 /// Runs a case of the stress suite that failed once.
 fn replay(family: &str, seed: u64, index: usize) {

@@ -1,7 +1,7 @@
 //! A little of `keysplat stress`: some cases of each family, none of which may fail. Those on the GPU say so loudly and pass where there is
 //! no adapter.
 
-use keysplat::stress::{self, CaseId, Machine, Part, StressConfig, StressReport};
+use keysplat::verification::stress::{self, CaseId, Machine, Part, StressConfig, StressReport};
 
 fn run(machine: Option<&Machine>, only: Part, cases: usize) -> StressReport {
     let config = StressConfig { cases, seed: 7, only: Some(only), long_steps: 800 };

@@ -3,7 +3,7 @@
 
 use std::path::Path;
 
-use keysplat::sequence::synthetic::SceneConfig;
+use keysplat::synthetic::SceneConfig;
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|text: &str| {

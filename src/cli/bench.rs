@@ -7,19 +7,19 @@ use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand, ValueEnum};
 use keysplat::bench::{BenchScene, Rates, StepBench, StepReport, bench_step, measure_rates};
-use keysplat::config::Config;
 use keysplat::export::MapFormat;
 use keysplat::geometry::{Pinhole, Se3, Trajectory};
 use keysplat::gpu::{AdapterSummary, Gpu, GpuError};
 use keysplat::optimise::TileSkip;
-use keysplat::pipeline::outputs;
 use keysplat::render::BlendForm;
+use keysplat::run_folder::outputs;
 use keysplat::sequence::{RectifiedImage, Rectifier};
 use keysplat::splat::{GaussianCloud, ShDegree, ViewCamera};
+use keysplat::{Config, Recording};
 use miette::{IntoDiagnostic, miette};
 use serde::Serialize;
 
-use super::{Verbosity, run};
+use super::Verbosity;
 
 #[derive(Args)]
 pub struct BenchArgs {
@@ -172,7 +172,7 @@ fn step(args: &StepArgs) -> miette::Result<()> {
     }
     let text = serde_json::to_string_pretty(&report).into_diagnostic()?;
     if let Some(path) = &args.out {
-        keysplat::export::write_atomically(path, text.as_bytes()).into_diagnostic()?;
+        keysplat::files::write_atomically(path, text.as_bytes()).into_diagnostic()?;
     }
     if args.json {
         println!("{text}");
@@ -189,8 +189,8 @@ struct RecordedView {
 
 impl RecordedView {
     fn open(dir: &Path) -> miette::Result<Self> {
-        let mut config = Config::read(&dir.join(outputs::CONFIG)).into_diagnostic()?;
-        let sequence = run::open(&mut config)?;
+        let recording = Recording::open(Config::read(&dir.join(outputs::CONFIG)).into_diagnostic()?).into_diagnostic()?;
+        let (sequence, config) = (recording.sequence(), recording.config());
         let keyframes = Trajectory::read_tum(&dir.join(outputs::KEYFRAMES)).into_diagnostic()?;
         let middle =
             keyframes.poses.get(keyframes.poses.len() / 2).ok_or_else(|| miette!("{} has no keyframes", dir.display()))?;

@@ -1,15 +1,12 @@
 //! `keysplat demo`: the synthetic room, rendered on first use, then mapped.
 
 use std::path::PathBuf;
-use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 
 use clap::Args;
-use keysplat::config::{Config, SequenceConfig};
-use keysplat::sequence::synthetic::SceneConfig;
+use keysplat::{Config, SceneConfig, Session};
 use miette::IntoDiagnostic;
 
-use super::{Verbosity, generate, print, progress, run};
+use super::{Verbosity, generate, print, run};
 
 const SCENE: &str = include_str!("../../sequences/demo.toml");
 /// The demo maps at half of its recorded size, which two cores without a GPU can do in a few minutes.
@@ -26,12 +23,8 @@ pub fn demo(args: &DemoArgs, verbosity: Verbosity) -> miette::Result<()> {
     let scene: SceneConfig = toml::from_str(SCENE).into_diagnostic()?;
     let recording = args.out.join("demo-room");
     generate::render_if_changed(&scene, &recording, verbosity)?;
-    let path = std::path::absolute(recording).into_diagnostic()?;
-    let sequence = Some(SequenceConfig { path, ..SequenceConfig::default() });
-    let config = Config { sequence, map_scale: MAP_SCALE, ..Config::default() };
-    let stop = Arc::new(AtomicBool::new(false));
-    progress::stop_on_ctrl_c(&stop)?;
-    run::replay(config, args.out.clone(), None, stop, verbosity)?;
+    let config = Config { map_scale: MAP_SCALE, ..Config::for_recording(&recording) };
+    run::replay(Session::open(config, &args.out).into_diagnostic()?, verbosity)?;
     if !verbosity.shows_progress() {
         return Ok(());
     }

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use indicatif::ProgressBar;
-use keysplat::sequence::synthetic::{self, SceneConfig};
+use keysplat::synthetic::{self, SceneConfig};
 use miette::IntoDiagnostic;
 
 use super::{Verbosity, progress};

@@ -93,8 +93,8 @@ pub fn main() -> ExitCode {
 
 fn execute(command: Command, verbosity: Verbosity) -> miette::Result<()> {
     match command {
-        Command::Run(args) => run::run(args, verbosity),
-        Command::Resume(args) => resume::resume(args, verbosity),
+        Command::Run(args) => run::run(&args, verbosity),
+        Command::Resume(args) => resume::resume(&args, verbosity),
         Command::Demo(args) => demo::demo(&args, verbosity),
         Command::Generate(args) => generate::generate(&args, verbosity),
         Command::Eval(args) => eval::eval(&args, verbosity),

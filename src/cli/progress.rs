@@ -17,6 +17,14 @@ pub fn bar(verbosity: Verbosity, len: u64, template: &str) -> ProgressBar {
     ProgressBar::new(len).with_style(style)
 }
 
+/// A bar without an end in the given template; hidden where nothing should be shown.
+pub fn spinner(verbosity: Verbosity, template: &str) -> ProgressBar {
+    if !verbosity.shows_progress() {
+        return ProgressBar::hidden();
+    }
+    ProgressBar::new_spinner().with_style(ProgressStyle::with_template(template).expect("our templates are valid"))
+}
+
 /// The first Ctrl-C asks the run to finish with what there is, the second ends the program.
 pub fn stop_on_ctrl_c(stop: &Arc<AtomicBool>) -> miette::Result<()> {
     let stop = stop.clone();

@@ -1,16 +1,15 @@
 //! `keysplat run`
 
-use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use clap::{Args, ValueEnum};
+use clap::Args;
 use indicatif::ProgressBar;
-use keysplat::config::{Config, SequenceConfig};
-use keysplat::gpu::Gpu;
-use keysplat::pipeline::{self, Budget, Checkpoint, Checkpoints, Outcome, PipelineError, Progress, outputs};
-use keysplat::sequence::{Layout, Sensor, SensorKind, Sequence, is_camera_file};
+use keysplat::config::SequenceConfig;
+use keysplat::presets::{self, Preset};
+use keysplat::sequence::{Layout, SensorKind, is_camera_file};
+use keysplat::{Config, Gpu, Progress, Recording, Session, SessionError};
 use miette::{IntoDiagnostic, miette};
 
 use super::{Verbosity, print_metrics, progress};
@@ -53,9 +52,9 @@ pub struct RunArgs {
     /// Part of the name of the adapter to use (see `keysplat adapters`).
     #[arg(long)]
     adapter: Option<String>,
-    /// How much time the run may take; goes over the configuration file, and the other options over it.
-    #[arg(long, value_enum)]
-    budget: Option<BudgetName>,
+    /// Named settings; override the configuration file, and the other options override them.
+    #[arg(long, alias = "budget", value_enum)]
+    preset: Option<Preset>,
     /// Most Gaussians that the map may have at any time; the least useful go first.
     #[arg(long)]
     max_gaussians: Option<usize>,
@@ -73,27 +72,6 @@ pub struct RunArgs {
 /// The same file, named from the root.
 fn absolute(path: &str) -> miette::Result<String> {
     Ok(std::path::absolute(path).into_diagnostic()?.to_string_lossy().into_owned())
-}
-
-/// See [`Budget`].
-#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub enum BudgetName {
-    /// Keep up with the recording's own pace: resolution and steps follow from what the adapter can do.
-    Realtime,
-    /// The defaults.
-    Balanced,
-    /// More steps and finer seeds.
-    Quality,
-}
-
-impl From<BudgetName> for Budget {
-    fn from(name: BudgetName) -> Self {
-        match name {
-            BudgetName::Realtime => Self::Realtime,
-            BudgetName::Balanced => Self::Balanced,
-            BudgetName::Quality => Self::Quality,
-        }
-    }
 }
 
 fn parse_bytes(text: &str) -> Result<u64, String> {
@@ -127,8 +105,8 @@ impl RunArgs {
             None if self.known_poses => Config::offline(),
             None => Config::default(),
         };
-        if let Some(budget) = self.budget {
-            config = Budget::from(budget).apply(&config).into_diagnostic()?;
+        if let Some(preset) = self.preset {
+            preset.apply(&mut config);
         }
         if let Some(path) = &self.sequence {
             // Absolute, so that the written configuration finds it from anywhere.
@@ -156,163 +134,60 @@ impl RunArgs {
     }
 }
 
-pub fn run(args: RunArgs, verbosity: Verbosity) -> miette::Result<()> {
-    let mut config = args.resolve()?;
-    if args.budget == Some(BudgetName::Realtime) && args.map_scale.is_none() {
-        let sequence = open(&mut config)?;
-        let gpu = Gpu::open(config.adapter.as_deref()).into_diagnostic()?;
-        config.map_scale = pipeline::realtime_scale(&gpu, &sequence, &config).into_diagnostic()?;
+pub fn run(args: &RunArgs, verbosity: Verbosity) -> miette::Result<()> {
+    let mut recording = Recording::open(args.resolve()?).into_diagnostic()?;
+    let gpu = Gpu::open(recording.config().adapter.as_deref()).into_diagnostic()?;
+    if args.preset == Some(Preset::Realtime) && args.map_scale.is_none() {
+        let scale = presets::realtime_scale(&gpu, &recording).into_diagnostic()?;
+        recording = recording.at_scale(scale).into_diagnostic()?;
     }
-    let stop = Arc::new(AtomicBool::new(false));
-    progress::stop_on_ctrl_c(&stop)?;
-    replay(config, args.out, None, stop, verbosity)
+    replay(Session::with_device(recording, gpu, &args.out).into_diagnostic()?, verbosity)
 }
 
-/// Opens the recording that a configuration names, with its selection of frames. A range that goes on beyond the recording then
-/// ends with it.
-pub fn open(config: &mut Config) -> miette::Result<Sequence> {
-    let named = config.sequence.as_ref().ok_or_else(|| miette!("the configuration names no recording"))?;
-    if named.path.is_file() {
-        tracing::info!("decoding {} for the times of its frames", named.path.display());
-    }
-    let mut sequence = Sequence::open(&named.path, named.layout, named.camera.as_deref()).into_diagnostic()?;
-    if let Some(kind) = named.sensor {
-        sequence.restrict_to(kind).into_diagnostic()?;
-    }
-    let recorded = sequence.entries.len();
-    let range = config.replay.frames.map(|(start, end)| start..end);
-    sequence.select(range, config.replay.every).into_diagnostic()?;
-    config.replay.frames = config.replay.frames.map(|(start, end)| (start, end.min(recorded)));
-    pipeline::check_size(&sequence, config.map_scale).into_diagnostic()?;
-    if config.replay.known_poses {
-        pipeline::check_known_poses(&sequence).into_diagnostic()?;
-    }
-    Ok(sequence)
-}
-
-/// Replays, writes everything, measures, prints. What was made is written before an error is reported. Goes on from a checkpoint, if given.
-pub fn replay(
-    mut config: Config,
-    out: PathBuf,
-    from: Option<Checkpoint>,
-    stop: Arc<AtomicBool>,
-    verbosity: Verbosity,
-) -> miette::Result<()> {
-    let sequence = open(&mut config)?;
-    let config = &config;
-    if !config.replay.known_poses {
-        pipeline::check_first_depth(&sequence).into_diagnostic()?;
-    }
-    let gpu = Gpu::open(config.adapter.as_deref()).into_diagnostic()?;
-    let _lock = outputs::prepare_folder(&out).into_diagnostic()?;
-    let checkpoints = checkpoints(from, (&sequence, config), &gpu, &out)?;
-    tracing::info!(
-        sequence = sequence.name,
-        sensor = %sequence.sensor.kind(),
-        frames = sequence.entries.len(),
-        adapter = gpu.adapter.name,
-        "replaying into {}",
-        out.display()
-    );
-    let windows = Progress { stop, ..Progress::default() };
+/// Runs a session to its metrics, with progress bars, and prints them.
+pub fn replay(mut session: Session, verbosity: Verbosity) -> miette::Result<()> {
+    let progress = Progress::default();
+    progress::stop_on_ctrl_c(&progress.stop)?;
+    let frames = session.recording().sequence().entries.len() as u64;
     let done = AtomicBool::new(false);
-    let mut outcome = std::thread::scope(|scope| {
-        let (windows, done) = (&windows, &done);
-        let bar = progress::bar(verbosity, sequence.entries.len() as u64, "{wide_bar} {pos}/{len} frames  {msg}");
-        scope.spawn(move || show(windows, &bar, done));
-        let outcome = pipeline::run(&sequence, &gpu, config, windows, checkpoints);
+    let replayed = std::thread::scope(|scope| {
+        let bar = progress::bar(verbosity, frames, "{wide_bar} {pos}/{len} frames  {msg}");
+        let (progress, done) = (&progress, &done);
+        scope.spawn(move || show(progress, &bar, done));
+        let replayed = session.run(progress);
         done.store(true, Ordering::Relaxed);
-        outcome
+        replayed
     })
     .into_diagnostic()?;
-    let error = outcome.error.take();
-    if outcome.poses.is_empty() {
-        return nothing_made(sequence.sensor, error, windows.stopped());
-    }
-    let finished = write_and_measure((&sequence, config), &gpu, &outcome, &out, verbosity);
-    if error.is_none() && finished.is_ok() && !windows.stopped() {
-        outputs::remove_checkpoint(&out).into_diagnostic()?;
-    } else if config.checkpoint_every.is_some() {
-        tracing::info!("keysplat resume {} goes on from the last checkpoint", out.display());
-    }
-    match (error, finished) {
-        (None, finished) => finished,
-        (Some(error), Ok(())) => Err(miette!("{error}\nThe run ended early; what there was until then is in {}", out.display())),
-        (Some(error), Err(then)) => Err(miette!("{error}\nThe run ended early, and then: {then}")),
-    }
-}
-
-/// Those of the run, if it keeps any.
-fn checkpoints(
-    from: Option<Checkpoint>,
-    recording: (&Sequence, &Config),
-    gpu: &Gpu,
-    out: &Path,
-) -> miette::Result<Option<Checkpoints>> {
-    if let Some(checkpoint) = from {
-        return Checkpoints::resume(checkpoint, recording, gpu).map(Some).into_diagnostic();
-    }
-    let begin = |_| Checkpoints::begin(&out.join(outputs::CHECKPOINT), recording, gpu);
-    recording.1.checkpoint_every.map(begin).transpose().into_diagnostic()
-}
-
-fn write_and_measure(
-    (sequence, config): (&Sequence, &Config),
-    gpu: &Arc<Gpu>,
-    outcome: &Outcome,
-    out: &Path,
-    verbosity: Verbosity,
-) -> miette::Result<()> {
-    let map = outputs::write_results(out, outcome, config).into_diagnostic()?;
-    let bar = progress::bar(verbosity, outcome.poses.len() as u64, "{wide_bar} {pos}/{len} views compared");
-    let measured = outputs::measure((sequence, config), gpu, &subject(outcome), out, &|done| bar.set_position(done as u64));
+    let bar = progress::bar(verbosity, replayed.result.poses.len() as u64, "{wide_bar} {pos}/{len} views compared");
+    let finished = session.finish(replayed, &|views| bar.set_position(views as u64));
     bar.finish_and_clear();
-    let measured = measured.into_diagnostic()?;
-    let metrics = outputs::write_metrics((sequence, config), gpu, outcome, (measured, map), out).into_diagnostic()?;
-    print_metrics(&metrics, verbosity)
-}
-
-/// Without a pose there is no trajectory, no map and no figure; what an earlier run left in the folder stays.
-fn nothing_made(sensor: Sensor, error: Option<PipelineError>, stopped: bool) -> miette::Result<()> {
-    match error {
-        Some(error) => Err(miette!("{error}")),
-        None if stopped => {
-            tracing::warn!("stopped before a frame was tracked, so nothing was written");
+    match finished {
+        Ok(metrics) => print_metrics(&metrics, verbosity),
+        Err(SessionError::Stopped) => {
+            tracing::warn!("{}", SessionError::Stopped);
             Ok(())
         }
-        None if sensor == Sensor::Mono => Err(miette!(
-            "not one frame could be tracked; the recording was replayed as mono, which needs texture and a camera that moves \
-             sideways; if it has depth, check that its depth.txt, or its depth folder, is there"
-        )),
-        None => Err(miette!(
-            "not one frame could be tracked; the images need texture, and depth between tracking.min_depth_metres and \
-             tracking.max_depth_metres"
-        )),
-    }
-}
-
-fn subject(outcome: &Outcome) -> outputs::Subject<'_> {
-    outputs::Subject {
-        trajectory: &outcome.trajectory,
-        poses: outcome.poses.iter().map(|(index, pose)| (*index, pose.world_from_camera)).collect(),
-        keyframes: outcome.keyframe_trajectory(),
-        keyframe_indices: outcome.keyframes.iter().map(|k| k.frame_index).collect(),
-        cloud: &outcome.cloud,
-        exposures: outcome.exposures(),
+        Err(error) => {
+            if let SessionError::EndedEarly { metrics, .. } = &error {
+                print_metrics(metrics, verbosity)?;
+            }
+            Err(error).into_diagnostic()
+        }
     }
 }
 
 /// Keeps the bar up to date until the run is done.
-fn show(windows: &Progress, bar: &ProgressBar, done: &AtomicBool) {
+fn show(progress: &Progress, bar: &ProgressBar, done: &AtomicBool) {
     let started = Instant::now();
     let (mut keyframes, mut lost, mut mapped) = (0, "", String::new());
     while !done.load(Ordering::Relaxed) {
-        if let Some(tracking) = windows.tracking.pop() {
+        if let Some(tracking) = progress.tracking.pop() {
             bar.set_position(tracking.frames_done as u64);
             keyframes = tracking.keyframes;
             lost = if tracking.lost { "  LOST" } else { "" };
         }
-        if let Some(map) = windows.mapping.pop() {
+        if let Some(map) = progress.mapping.pop() {
             mapped = format!(", {} mapped, {} Gaussians, {:.1} dB", map.keyframes, map.cloud.len(), map.psnr_db);
         }
         let rate = bar.position() as f64 / started.elapsed().as_secs_f64().max(1e-3);

@@ -3,9 +3,9 @@
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use keysplat::export::write_atomically;
+use keysplat::files::write_atomically;
 use keysplat::gpu::AdapterSummary;
-use keysplat::stress::{CaseId, FamilyReport, Machine, Part, StressConfig, StressReport};
+use keysplat::verification::stress::{CaseId, FamilyReport, Machine, Part, StressConfig, StressReport};
 use miette::{IntoDiagnostic, miette};
 use serde::Serialize;
 
@@ -61,7 +61,7 @@ pub fn stress(args: &StressArgs) -> miette::Result<()> {
             let _ = print(&family.to_string());
         }
     };
-    let report = keysplat::stress::run(machine.as_ref(), &config, tell).into_diagnostic()?;
+    let report = keysplat::verification::stress::run(machine.as_ref(), &config, tell).into_diagnostic()?;
     let adapter = machine.as_ref().map(|machine| &machine.gpu.adapter);
     let cpu = keysplat::evaluation::machine::cpu_name();
     let text = serde_json::to_string_pretty(&Output { adapter, cpu, version: env!("CARGO_PKG_VERSION"), report: &report });
@@ -97,7 +97,8 @@ fn write(out: &Path, text: &str, report: &StressReport) -> miette::Result<()> {
 fn replay(args: &StressArgs, config: &StressConfig, file: &Path) -> miette::Result<()> {
     let text = std::fs::read_to_string(file).map_err(|error| miette!("cannot read {}: {error}", file.display()))?;
     let case: CaseId = serde_json::from_str(&text).map_err(|error| miette!("{} is no case: {error}", file.display()))?;
-    let outcome = keysplat::stress::replay(machine(args, Some(case.part))?.as_ref(), config, &case).into_diagnostic()?;
+    let outcome =
+        keysplat::verification::stress::replay(machine(args, Some(case.part))?.as_ref(), config, &case).into_diagnostic()?;
     let outcome = outcome.ok_or_else(|| miette!("{}: there is no family `{}`", file.display(), case.family))?;
     print(&format!("{}\n", serde_json::to_string_pretty(&outcome).into_diagnostic()?))?;
     let failures = outcome.failures();

@@ -61,22 +61,38 @@ struct ViewFigures {
     depth_l1: Option<f64>,
 }
 
-/// Compares all posed views; `on_held_out` gets each held-out one. Frames that cannot be read are left out. `progress` hears how
-/// many views are done.
+/// A map and the recording that it is compared with.
+#[derive(Clone, Copy, Debug)]
+pub struct ViewSource<'a> {
+    /// Recorded frames.
+    pub sequence: &'a Sequence,
+    /// Resolution to compare at, as a share of the recorded one.
+    pub map_scale: f64,
+    /// Adapter that renders.
+    pub gpu: &'a Arc<Gpu>,
+    /// The map.
+    pub cloud: &'a GaussianCloud,
+}
+
+/// Compares all posed views with their renders. Frames that cannot be read are left out. `on_held_out` receives each held-out view, `on_view`
+/// the number of views done.
+///
+/// # Errors
+/// If the adapter fails.
 pub fn evaluate_views(
-    (sequence, map_scale): (&Sequence, f64),
-    (gpu, cloud): (&Arc<Gpu>, &GaussianCloud),
+    source: ViewSource<'_>,
     selection: &ViewSelection<'_>,
     on_held_out: &mut dyn FnMut(ComparedView),
-    progress: &dyn Fn(usize),
+    on_view: &dyn Fn(usize),
 ) -> Result<ImageProtocols, GpuError> {
+    let ViewSource { sequence, map_scale, gpu, cloud } = source;
     let rectifier = Rectifier::new(&sequence.camera, map_scale);
     let mut rasterizer = Rasterizer::new(gpu.clone())?;
     let mut on_gpu = GpuCloud::new(gpu, cloud.sh_degree, cloud.len())?;
     on_gpu.append(gpu, cloud)?;
     let [mut held_out, mut map_colors, mut all_frames, mut monogs] = [ImageMeans::default(); 4];
     for (batch, poses) in selection.poses.chunks(BATCH).enumerate() {
-        progress(batch * BATCH);
+        on_view(batch * BATCH);
         let indices: Vec<usize> = poses.iter().map(|(index, _)| *index).collect();
         let frames = sequence.load_all(&indices);
         let recorded: Vec<Option<RectifiedImage>> =

@@ -1,4 +1,4 @@
-//! Takes the place of tracking where the recording says where its frames were taken.
+//! Replaces tracking where the recording provides poses.
 //!
 //! Photos become keyframes all, frames of a moving camera where it has moved as far as the tracker would ask for; held-out ones never.
 //! Frames without a pose count as lost. Where the recording has no depth, its points begin the map, and the world's unit is theirs.
@@ -6,18 +6,16 @@
 use std::collections::HashSet;
 use std::time::Instant;
 
-use crossbeam::channel::{Receiver, Sender};
 use nalgebra::{Point3, Vector3};
 use rayon::prelude::*;
 
-use super::messages::{TrackingProgress, guarded};
-use super::track_thread::{KeyframeSender, TrackSummary};
-use super::{FrameRecord, MapperMessage, PipelineError, Progress};
-use crate::config::Config;
-use crate::evaluation::trajectory::MAX_TIME_DIFFERENCE_S;
+use super::progress::{TrackingProgress, guarded};
+use super::track_thread::{KeyframeSender, TrackSummary, TrackThread};
 use crate::geometry::{Se3, StampedPose};
-use crate::mapping::{DepthSource, Keyframe, MappingConfig};
-use crate::sequence::{Frame, KnownPoint, Layout, RectifiedImage, Rectifier, Sensor, Sequence};
+use crate::mapping::{DepthSource, Keyframe, MapperMessage, MappingConfig};
+use crate::recording::Recording;
+use crate::run_folder::FrameRecord;
+use crate::sequence::{Frame, KnownPoint, Layout, RectifiedImage, Rectifier, Sensor};
 use crate::tracking::{KeyframePose, StageTimes};
 
 /// What the mapper's lengths are made for: the median distance, in metres, at which a camera sees things in a room.
@@ -28,35 +26,22 @@ const SAMPLED_POINTS: usize = 2000;
 /// Neighbours that a keyframe names.
 const COVISIBLE: usize = 10;
 
-/// Says before any work whether a recording can be mapped by its own poses.
-pub fn check_known_poses(sequence: &Sequence) -> Result<(), PipelineError> {
-    let name = || sequence.name.clone();
-    if !sequence.entries.iter().any(|entry| known_pose(sequence, entry.timestamp_s).is_some()) {
-        return Err(PipelineError::NoKnownPoses { name: name(), seconds: MAX_TIME_DIFFERENCE_S });
+/// Units of the recording's world per metre: 1 where depth is measured, else such that the points' median distance is that of a room.
+fn units_per_metre(recording: &Recording) -> f64 {
+    if recording.sequence().sensor == Sensor::Rgbd {
+        return 1.0;
     }
-    let seeded = sequence.sensor == Sensor::Rgbd || !sequence.points.is_empty();
-    if seeded { Ok(()) } else { Err(PipelineError::NoKnownPoints { name: name() }) }
-}
-
-/// world_from_camera at a time.
-fn known_pose(sequence: &Sequence, timestamp_s: f64) -> Option<Se3> {
-    let truth = sequence.groundtruth.as_ref()?;
-    truth.nearest(timestamp_s, MAX_TIME_DIFFERENCE_S).map(|i| truth.poses[i].world_from_camera)
-}
-
-/// Units of the known world to a metre as the mapper's lengths mean it: 1 where depth is measured, else such that the points are as
-/// far as things in a room are.
-pub(super) fn units_per_metre(sequence: &Sequence) -> f64 {
-    if sequence.sensor == Sensor::Rgbd { 1.0 } else { scene_distance(sequence).map_or(1.0, |d| d / USUAL_DISTANCE_METRES) }
+    scene_distance(recording).map_or(1.0, |distance| distance / USUAL_DISTANCE_METRES)
 }
 
 /// Median depth of the points in the cameras that have them in view.
-fn scene_distance(sequence: &Sequence) -> Option<f64> {
+fn scene_distance(recording: &Recording) -> Option<f64> {
+    let sequence = recording.sequence();
     let sample = |len: usize, most: usize| (0..len).step_by(len.div_ceil(most).max(1));
     let pinhole = &sequence.camera.pinhole;
     let mut depths = Vec::new();
     for entry in sample(sequence.entries.len(), SAMPLED_CAMERAS).map(|i| &sequence.entries[i]) {
-        let Some(world_from_camera) = known_pose(sequence, entry.timestamp_s) else { continue };
+        let Some(world_from_camera) = recording.known_pose(entry.timestamp_s) else { continue };
         let camera_from_world = world_from_camera.inverse();
         for point in sample(sequence.points.len(), SAMPLED_POINTS).map(|i| &sequence.points[i]) {
             let p_in_camera = (camera_from_world * Point3::from(point.position)).coords;
@@ -74,8 +59,9 @@ fn median(mut values: Vec<f64>) -> Option<f64> {
 
 /// The points that begin the map: of those that share a cube of `mapping.points.spacing_pixels` in the nearest view, the first. Denser ones
 /// would only cost time. Points that no frame sees are left out.
-fn thinned_points(sequence: &Sequence, config: &Config) -> Vec<KnownPoint> {
-    let poses = sequence.entries.iter().filter_map(|entry| known_pose(sequence, entry.timestamp_s));
+fn thinned_points(recording: &Recording) -> Vec<KnownPoint> {
+    let (sequence, config) = (recording.sequence(), recording.config());
+    let poses = sequence.entries.iter().filter_map(|entry| recording.known_pose(entry.timestamp_s));
     let cameras: Vec<Se3> = poses.map(|world_from_camera| world_from_camera.inverse()).collect();
     let pinhole = &sequence.camera.pinhole;
     let cell_per_depth = f64::from(config.mapping.points.spacing_pixels) / (pinhole.fx * config.map_scale);
@@ -95,8 +81,13 @@ fn thinned_points(sequence: &Sequence, config: &Config) -> Vec<KnownPoint> {
 }
 
 /// The mapper's configuration for a recording.
-pub(super) fn mapping_config(sequence: &Sequence, config: &Config) -> MappingConfig {
-    if config.replay.known_poses { config.mapping.in_units(units_per_metre(sequence) as f32) } else { config.mapping.clone() }
+pub(super) fn mapping_config(recording: &Recording) -> MappingConfig {
+    mapping_config_in_units(recording, &recording.config().mapping)
+}
+
+/// A variant of the mapper's configuration, its lengths in the unit of the recording's world.
+pub(super) fn mapping_config_in_units(recording: &Recording, mapping: &MappingConfig) -> MappingConfig {
+    if recording.config().replay.known_poses { mapping.in_units(units_per_metre(recording) as f32) } else { mapping.clone() }
 }
 
 /// A keyframe so far.
@@ -107,8 +98,7 @@ struct Known {
 }
 
 struct Follower<'a> {
-    sequence: &'a Sequence,
-    config: &'a Config,
+    recording: &'a Recording,
     rectifier: Rectifier,
     keyframes: Vec<Known>,
     /// Where frames have no depth.
@@ -119,14 +109,15 @@ impl Follower<'_> {
     /// How far apart two views are: 1 where a keyframe is due, by distance or by angle.
     fn apart(&self, a: &Known, world_from_camera: &Se3) -> f64 {
         let a_from_camera = a.pose.world_from_camera.inverse() * world_from_camera;
-        let moved = a_from_camera.translation.vector.norm() / (self.config.tracking.keyframe_translation * a.distance);
-        moved.max(a_from_camera.rotation.angle() / self.config.tracking.keyframe_rotation_rad)
+        let moved =
+            a_from_camera.translation.vector.norm() / (self.recording.config().tracking.keyframe_translation * a.distance);
+        moved.max(a_from_camera.rotation.angle() / self.recording.config().tracking.keyframe_rotation_rad)
     }
 
     fn is_due(&self, index: usize, world_from_camera: &Se3) -> bool {
-        let photos = matches!(self.sequence.layout, Layout::Colmap | Layout::Transforms);
+        let photos = matches!(self.recording.sequence().layout, Layout::Colmap | Layout::Transforms);
         let far = |last: &Known| self.apart(last, world_from_camera) >= 1.0;
-        !self.config.replay.is_held_out(index) && (photos || self.keyframes.last().is_none_or(far))
+        !self.recording.config().replay.is_held_out(index) && (photos || self.keyframes.last().is_none_or(far))
     }
 
     /// The nearest keyframes, nearest first.
@@ -152,25 +143,21 @@ fn median_depth(image: &RectifiedImage) -> Option<f64> {
     median(depth.metres.iter().filter(|metres| **metres > 0.0).map(|metres| f64::from(*metres)).collect())
 }
 
-/// Hands frames on at their known poses until they end, or the mapper stops listening.
-pub(super) fn follow(
-    sequence: &Sequence,
-    config: &Config,
-    frames: &Receiver<Frame>,
-    mapper: &Sender<MapperMessage>,
-    progress: &Progress,
-) -> TrackSummary {
+/// Sends keyframes at their known poses until the frames end, or the mapper closes the channel.
+pub(super) fn follow(thread: &TrackThread<'_>) -> TrackSummary {
+    let TrackThread { recording, frames, mapper, progress } = *thread;
+    let (sequence, config) = (recording.sequence(), recording.config());
     let mut summary = TrackSummary::default();
     let mut sender = KeyframeSender::new(mapper, config.replay.paced);
     let rectifier = Rectifier::new(&sequence.camera, config.map_scale);
-    let scene_distance = scene_distance(sequence).unwrap_or(USUAL_DISTANCE_METRES);
-    let mut follower = Follower { sequence, config, rectifier, keyframes: Vec::new(), scene_distance };
-    if sequence.sensor != Sensor::Rgbd && mapper.send(MapperMessage::Points(thinned_points(sequence, config))).is_err() {
+    let scene_distance = scene_distance(recording).unwrap_or(USUAL_DISTANCE_METRES);
+    let mut follower = Follower { recording, rectifier, keyframes: Vec::new(), scene_distance };
+    if sequence.sensor != Sensor::Rgbd && mapper.send(MapperMessage::Points(thinned_points(recording))).is_err() {
         return summary;
     }
     for frame in frames {
         let started = Instant::now();
-        let known = known_pose(sequence, frame.timestamp_s);
+        let known = recording.known_pose(frame.timestamp_s);
         let mut keyframe = None;
         if let Some(world_from_camera) = known {
             summary.trajectory.push((frame.index, StampedPose { timestamp_s: frame.timestamp_s, world_from_camera }));
@@ -179,7 +166,7 @@ pub(super) fn follow(
             }
         }
         let times = StageTimes { features_ms: started.elapsed().as_secs_f64() * 1e3, ..StageTimes::default() };
-        summary.frames.push(FrameRecord { frame: frame.index, lost: false, times });
+        summary.frames.push(FrameRecord { frame: frame.index, lost: known.is_none(), times });
         let (frames_done, keyframes) = (frame.index + 1, follower.keyframes.len());
         progress.tracking.force_push(TrackingProgress { frames_done, keyframes, lost: known.is_none() });
         let message = match keyframe.transpose() {

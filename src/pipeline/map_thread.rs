@@ -1,4 +1,4 @@
-//! Maps keyframes as they come, refines the map after the last one, and publishes a snapshot after each.
+//! The mapping thread: maps keyframes as they arrive, refines the map after the last one, and publishes a snapshot after each.
 
 use std::cell::RefCell;
 use std::collections::VecDeque;
@@ -7,22 +7,22 @@ use std::time::{Duration, Instant};
 
 use crossbeam::channel::Receiver;
 
-use super::keeper::{Checkpoints, Resumed};
-use super::measurements::Teller;
-use super::messages::guarded;
-use super::{KeyframeRecord, MapperMessage, PipelineError, Progress};
+use super::pose_feedback::PoseFeedbackSender;
+use super::progress::guarded;
+use super::{PipelineError, Progress};
 use crate::evaluation::machine;
 use crate::gpu::Gpu;
-use crate::mapping::{KeyframeReport, Mapper, MappingConfig, MappingError, RefinedPair, Refinement};
+use crate::mapping::{KeyframeReport, Mapper, MapperMessage, MappingConfig, MappingError, RefinedPair, Refinement};
+use crate::run_folder::{CheckpointError, Checkpointer, KeyframeRecord, RunState};
 use crate::sequence::Frame;
 use crate::splat::{GaussianCloud, MapSnapshot};
 
-/// Paced replay: the mapper pauses between two batches of steps while more frames than this wait for the tracker,
+/// Real time: the mapper pauses between two batches of steps while more frames than this wait for the tracker,
 const MOST_WAITING: usize = 2;
 /// but never longer than this.
 const LONGEST_PAUSE: Duration = Duration::from_millis(200);
 
-/// What mapping came to, also when it ended early.
+/// Result of the mapping thread, also when it ended early.
 #[derive(Debug, Default)]
 pub(super) struct MapSummary {
     /// The map after the last keyframe that was finished.
@@ -30,7 +30,7 @@ pub(super) struct MapSummary {
     pub keyframes: Vec<KeyframeRecord>,
     /// Duration of each optimisation step, milliseconds.
     pub step_ms: Vec<f64>,
-    /// It did not come as far as the checkpoint that it was to go on from, and there is nothing to write.
+    /// The thread ended before it reached its checkpoint; there is nothing to write.
     pub behind: bool,
     pub error: Option<PipelineError>,
 }
@@ -42,72 +42,199 @@ pub(super) struct Round<'a> {
     pub steps: usize,
 }
 
-/// Maps until the tracker hangs up, then refines; or until an error. `on_round` hears of each round of the refinement. With checkpoints, it
-/// goes on from the one that there is, and keeps more. `frames`, those that wait for the tracker, are given where they must not wait long.
-pub(super) fn map(
-    gpu: &Arc<Gpu>,
-    config: &MappingConfig,
-    (messages, frames): (&Receiver<MapperMessage>, Option<&Receiver<Frame>>),
-    tracker: &Teller,
-    (progress, on_round): (&Progress, &mut dyn FnMut(Round<'_>)),
-    mut checkpoints: Option<Checkpoints>,
-) -> MapSummary {
-    let behind = checkpoints.as_ref().is_some_and(Checkpoints::is_behind);
-    let begun = guarded("mapping", || begin(gpu, config, (messages, tracker), checkpoints.as_mut()));
-    let (Resumed { mut mapper, refinement, records }, cloud) = match begun {
-        Ok(begun) => begun,
-        Err(error) => return MapSummary { behind, error: Some(error), ..MapSummary::default() },
-    };
-    let earlier_s = records.last().map_or(0.0, |record| record.done_s);
-    let mut summary = MapSummary { cloud, keyframes: records, ..MapSummary::default() };
-    let started = Instant::now();
-    let inbox = Inbox { messages, ahead: RefCell::default() };
-    while let Some(message) = inbox.next() {
-        let (waiting, began) = (inbox.waiting(), Instant::now());
-        let stop = || {
-            frames.into_iter().for_each(let_catch_up);
-            progress.stopped() || (config.yields_to_keyframes && inbox.keyframe_waits())
-        };
-        checkpoints.iter_mut().for_each(|c| c.hear(&message));
-        let done = guarded("mapping", || take(&mut mapper, message, tracker, &stop));
-        match done {
-            Ok(Taken { report, refined, cloud }) => {
-                tracing::debug!(?report, "message taken");
-                let record = |report| KeyframeRecord {
-                    report,
-                    done_s: earlier_s + started.elapsed().as_secs_f64(),
-                    busy_s: began.elapsed().as_secs_f64(),
-                    waiting,
-                    host_bytes: machine::host_bytes(),
-                };
-                summary.keyframes.extend(report.map(record));
-                let psnr_db = summary.keyframes.last().map_or(0.0, |k| k.report.psnr_db);
-                summary.publish(cloud, psnr_db, progress);
-                // A keyframe that was cut short is not as it would have been.
-                if let Some(checkpoints) = checkpoints.as_mut().filter(|_| report.is_some() && !progress.stopped()) {
-                    checkpoints.tell(refined);
-                    checkpoints.done(&mapper, None, &summary.keyframes);
-                }
-            }
-            Err(error) => {
-                summary.error = Some(error);
-                break;
-            }
-        }
-    }
-    if summary.error.is_none() && mapper.has_not_begun() && !summary.keyframes.is_empty() {
-        summary.error = Some(MappingError::NoDepth.into());
-    }
-    if summary.error.is_none() {
-        let begun = (refinement, checkpoints.as_mut());
-        let refined = guarded("mapping", || refine(&mut mapper, &mut summary, begun, (progress, on_round)));
-        summary.error = refined.err();
-    }
-    summary.step_ms = mapper.step_times().iter().map(|t| t.as_secs_f64() * 1e3).collect();
-    summary
+/// Input of the mapping thread.
+#[derive(Clone, Copy)]
+pub(super) struct MapThread<'a> {
+    pub gpu: &'a Arc<Gpu>,
+    pub config: &'a MappingConfig,
+    pub messages: &'a Receiver<MapperMessage>,
+    /// Real time: frames that wait for the tracker.
+    pub frames: Option<&'a Receiver<Frame>>,
+    pub feedback: &'a PoseFeedbackSender,
+    pub progress: &'a Progress,
 }
 
-/// What the tracker sent, in its order, of which the mapper may look ahead.
+/// The mapper at the start of the thread's work.
+struct Start {
+    mapper: Mapper,
+    cloud: Arc<GaussianCloud>,
+    /// Of a resumed run whose final refinement had begun.
+    refinement: Option<Refinement>,
+    records: Vec<KeyframeRecord>,
+}
+
+impl MapThread<'_> {
+    /// Maps until the tracker closes the channel, then refines; or until an error. `on_round` receives each round of the final refinement.
+    /// With a checkpointer, continues from its state and writes checkpoints.
+    pub fn map(self, on_round: &mut dyn FnMut(Round<'_>), mut checkpointer: Option<Checkpointer>) -> MapSummary {
+        let behind = checkpointer.as_ref().is_some_and(Checkpointer::is_behind);
+        let start = guarded("mapping", || self.start(checkpointer.as_mut()));
+        let Start { mut mapper, cloud, refinement, records } = match start {
+            Ok(start) => start,
+            Err(error) => return MapSummary { behind, error: Some(error), ..MapSummary::default() },
+        };
+        let mut summary = MapSummary { cloud, keyframes: records, ..MapSummary::default() };
+        let mut checkpoints = Checkpoints { checkpointer, failed: false };
+        let mapped = self.map_messages(&mut mapper, &mut summary, &mut checkpoints);
+        summary.error = mapped.err();
+        if summary.error.is_none() && mapper.has_not_begun() && !summary.keyframes.is_empty() {
+            summary.error = Some(MappingError::NoDepth.into());
+        }
+        if summary.error.is_none() {
+            let refined = guarded("mapping", || self.refine(&mut mapper, &mut summary, refinement, &mut checkpoints, on_round));
+            summary.error = refined.err();
+        }
+        summary.step_ms = mapper.step_times().iter().map(|t| t.as_secs_f64() * 1e3).collect();
+        summary
+    }
+
+    /// A new mapper and an empty map, or those of a checkpoint.
+    fn start(&self, checkpointer: Option<&mut Checkpointer>) -> Result<Start, PipelineError> {
+        if let Some(checkpointer) = checkpointer
+            && let Some(state) = checkpointer.take_state()
+        {
+            return self.catch_up(checkpointer, state);
+        }
+        let mapper = Mapper::new(self.gpu.clone(), self.config)?;
+        Ok(Start { mapper, cloud: Arc::default(), refinement: None, records: Vec::new() })
+    }
+
+    /// Replays the messages up to a checkpoint: uploads keyframe images, and sends the tracker the stored pose feedback.
+    ///
+    /// # Errors
+    /// If the messages end before the checkpoint, or differ from those before the interruption.
+    fn catch_up(&self, checkpointer: &mut Checkpointer, state: RunState) -> Result<Start, PipelineError> {
+        let path = checkpointer.path().to_owned();
+        let not_repeated = || PipelineError::NotRepeated { checkpoint: path.clone() };
+        let explained = |error| match error {
+            MappingError::State => CheckpointError::Damaged { path: path.clone() }.into(),
+            MappingError::NotTheSame { .. } => not_repeated(),
+            error => error.into(),
+        };
+        let mut mapper = Mapper::restore(self.gpu.clone(), self.config, &state.mapper).map_err(explained)?;
+        let records = state.records();
+        let keyframes = state.feedback.len();
+        let mut feedback = state.feedback.into_iter();
+        while checkpointer.digest().messages < state.digest.messages {
+            let Ok(message) = self.messages.recv() else { return Err(PipelineError::NotCaughtUp { checkpoint: path }) };
+            checkpointer.received(&message);
+            if let MapperMessage::Keyframe(keyframe) = message {
+                mapper.insert_again(&keyframe, &state.mapper).map_err(explained)?;
+                let refined = feedback.next().ok_or_else(not_repeated)?;
+                self.feedback.send(keyframe.id, &refined);
+                checkpointer.sent_feedback(refined);
+            }
+        }
+        if checkpointer.digest() != state.digest || feedback.len() > 0 {
+            return Err(not_repeated());
+        }
+        tracing::info!(keyframes, gaussians = mapper.gaussians(), "checkpoint reached");
+        let cloud = Arc::new(mapper.download()?);
+        Ok(Start { mapper, cloud, refinement: state.mapper.into_refinement(), records })
+    }
+
+    fn map_messages(
+        &self,
+        mapper: &mut Mapper,
+        summary: &mut MapSummary,
+        checkpoints: &mut Checkpoints,
+    ) -> Result<(), PipelineError> {
+        let earlier_s = summary.keyframes.last().map_or(0.0, |record| record.done_s);
+        let started = Instant::now();
+        let inbox = Inbox { messages: self.messages, ahead: RefCell::default() };
+        while let Some(message) = inbox.next() {
+            let (waiting, began) = (inbox.waiting(), Instant::now());
+            let stop = || {
+                self.frames.into_iter().for_each(wait_for_tracker);
+                self.progress.stopped() || (self.config.yields_to_keyframes && inbox.keyframe_waits())
+            };
+            checkpoints.checkpointer.iter_mut().for_each(|c| c.received(&message));
+            let Processed { report, refined, cloud } = guarded("mapping", || self.process(mapper, message, &stop))?;
+            tracing::debug!(?report, "message processed");
+            let record = |report| KeyframeRecord {
+                report,
+                done_s: earlier_s + started.elapsed().as_secs_f64(),
+                busy_s: began.elapsed().as_secs_f64(),
+                waiting,
+                host_bytes: machine::host_bytes(),
+            };
+            summary.keyframes.extend(report.map(record));
+            let psnr_db = summary.keyframes.last().map_or(0.0, |k| k.report.psnr_db);
+            summary.publish(cloud, psnr_db, self.progress);
+            // A keyframe that was cut short differs from that of an unbroken run.
+            if report.is_some() && !self.progress.stopped() {
+                checkpoints.checkpointer.iter_mut().for_each(|c| c.sent_feedback(refined.clone()));
+                checkpoints.finished_one(mapper, None, &summary.keyframes);
+            }
+        }
+        Ok(())
+    }
+
+    fn process(&self, mapper: &mut Mapper, message: MapperMessage, stop: &dyn Fn() -> bool) -> Result<Processed, PipelineError> {
+        let (report, refined, changed) = match message {
+            MapperMessage::Points(points) => {
+                mapper.add_points(&points, 0)?;
+                (None, Vec::new(), true)
+            }
+            MapperMessage::PoseUpdate(updates) => (None, Vec::new(), mapper.update_poses(&updates)? > 0),
+            MapperMessage::Keyframe(keyframe) => {
+                let report = mapper.insert(&keyframe, stop)?;
+                let refined = mapper.refined();
+                tracing::trace!(keyframe = keyframe.id, ?refined, "poses refined");
+                self.feedback.send(keyframe.id, &refined);
+                (Some(report), refined, report.seeded + report.iterations > 0)
+            }
+        };
+        let cloud = if changed { Some(Arc::new(mapper.download()?)) } else { None };
+        Ok(Processed { report, refined, cloud })
+    }
+
+    /// The final refinement, one round at a time, each published; continues the one that a resumed run had begun.
+    fn refine(
+        &self,
+        mapper: &mut Mapper,
+        summary: &mut MapSummary,
+        begun: Option<Refinement>,
+        checkpoints: &mut Checkpoints,
+        on_round: &mut dyn FnMut(Round<'_>),
+    ) -> Result<(), PipelineError> {
+        let first = mapper.begin_refinement()?;
+        let mut refinement = begun.unwrap_or(first);
+        while let Some(report) = mapper.refine(&mut refinement, &|| self.progress.stopped())? {
+            tracing::debug!(?report, "refined");
+            summary.publish(Some(Arc::new(mapper.download()?)), report.psnr_db, self.progress);
+            on_round(Round { cloud: &summary.cloud, steps: mapper.step_times().len() });
+            if !self.progress.stopped() {
+                checkpoints.finished_one(mapper, Some(&refinement), &summary.keyframes);
+            }
+        }
+        Ok(())
+    }
+}
+
+/// The run's checkpointer, if any. A checkpoint that fails does not end the run.
+struct Checkpoints {
+    checkpointer: Option<Checkpointer>,
+    failed: bool,
+}
+
+impl Checkpoints {
+    fn finished_one(&mut self, mapper: &Mapper, refinement: Option<&Refinement>, records: &[KeyframeRecord]) {
+        let Some(checkpointer) = &mut self.checkpointer else { return };
+        let began = Instant::now();
+        match guarded("mapping", || Ok(checkpointer.finished_one(mapper, refinement, records)?)) {
+            Ok(None) => {}
+            Ok(Some(bytes)) => tracing::debug!(bytes, ms = began.elapsed().as_secs_f64() * 1e3, "checkpoint written"),
+            Err(error) if !self.failed => {
+                self.failed = true;
+                tracing::warn!("{error}; the run goes on, and the checkpoint before this one stays");
+            }
+            Err(_) => {}
+        }
+    }
+}
+
+/// Messages of the tracker, in order, with look-ahead.
 struct Inbox<'a> {
     messages: &'a Receiver<MapperMessage>,
     /// Taken from the channel to look at: at most one keyframe and the pose updates before it.
@@ -115,7 +242,7 @@ struct Inbox<'a> {
 }
 
 impl Inbox<'_> {
-    /// Waits for the next one; `None` when the tracker has hung up.
+    /// Blocks until the next message; `None` when the tracker has closed the channel.
     fn next(&self) -> Option<MapperMessage> {
         let first = self.ahead.borrow_mut().pop_front();
         first.or_else(|| self.messages.recv().ok())
@@ -139,78 +266,21 @@ impl Inbox<'_> {
     }
 }
 
-/// Leaves the machine to the tracker while frames wait for it; not for long, for a tracker that never catches up needs a map all the same.
-fn let_catch_up(frames: &Receiver<Frame>) {
+/// Yields the processor while frames wait for the tracker, at most [`LONGEST_PAUSE`]: a tracker that stays behind needs a map all the same.
+fn wait_for_tracker(frames: &Receiver<Frame>) {
     let began = Instant::now();
     while frames.len() > MOST_WAITING && began.elapsed() < LONGEST_PAUSE {
         std::thread::sleep(Duration::from_millis(1));
     }
 }
 
-/// The mapper to begin with, and its map: a new one, or that of a checkpoint.
-fn begin(
-    gpu: &Arc<Gpu>,
-    config: &MappingConfig,
-    channels: (&Receiver<MapperMessage>, &Teller),
-    checkpoints: Option<&mut Checkpoints>,
-) -> Result<(Resumed, Arc<GaussianCloud>), PipelineError> {
-    match checkpoints.map(|c| c.catch_up(gpu, config, channels)).transpose()?.flatten() {
-        Some(resumed) => {
-            let cloud = Arc::new(resumed.mapper.download()?);
-            Ok((resumed, cloud))
-        }
-        None => {
-            let mapper = Mapper::new(gpu.clone(), config)?;
-            Ok((Resumed { mapper, refinement: None, records: Vec::new() }, Arc::default()))
-        }
-    }
-}
-
-/// What a message did; the map, if it changed.
-struct Taken {
+/// Effects of one message.
+struct Processed {
     report: Option<KeyframeReport>,
-    /// What the tracker was told of the keyframe.
+    /// Pose feedback of the keyframe.
     refined: Vec<RefinedPair>,
+    /// The map, if it changed.
     cloud: Option<Arc<GaussianCloud>>,
-}
-
-fn take(mapper: &mut Mapper, message: MapperMessage, tracker: &Teller, stop: &dyn Fn() -> bool) -> Result<Taken, PipelineError> {
-    let (report, refined, changed) = match message {
-        MapperMessage::Points(points) => {
-            mapper.add_points(&points, 0)?;
-            (None, Vec::new(), true)
-        }
-        MapperMessage::PoseUpdate(updates) => (None, Vec::new(), mapper.update_poses(&updates)? > 0),
-        MapperMessage::Keyframe(keyframe) => {
-            let report = mapper.insert(&keyframe, stop)?;
-            let refined = mapper.refined();
-            tracing::trace!(keyframe = keyframe.id, ?refined, "poses refined");
-            tracker.tell(keyframe.id, &refined);
-            (Some(report), refined, report.seeded + report.iterations > 0)
-        }
-    };
-    let cloud = if changed { Some(Arc::new(mapper.download()?)) } else { None };
-    Ok(Taken { report, refined, cloud })
-}
-
-/// The refinement, a round at a time, each published; it goes on where it stood, if it had begun.
-fn refine(
-    mapper: &mut Mapper,
-    summary: &mut MapSummary,
-    (begun, mut checkpoints): (Option<Refinement>, Option<&mut Checkpoints>),
-    (progress, on_round): (&Progress, &mut dyn FnMut(Round<'_>)),
-) -> Result<(), PipelineError> {
-    let first = mapper.begin_refinement()?;
-    let mut refinement = begun.unwrap_or(first);
-    while let Some(report) = mapper.refine(&mut refinement, &|| progress.stopped())? {
-        tracing::debug!(?report, "refined");
-        summary.publish(Some(Arc::new(mapper.download()?)), report.psnr_db, progress);
-        on_round(Round { cloud: &summary.cloud, steps: mapper.step_times().len() });
-        if let Some(checkpoints) = checkpoints.as_mut().filter(|_| !progress.stopped()) {
-            checkpoints.done(mapper, Some(&refinement), &summary.keyframes);
-        }
-    }
-    Ok(())
 }
 
 impl MapSummary {

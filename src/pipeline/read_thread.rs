@@ -7,16 +7,16 @@ use crossbeam::channel::{Sender, TrySendError};
 use super::Progress;
 use crate::sequence::{Frame, Sequence};
 
-/// What reading came to.
+/// Result of the reading thread.
 #[derive(Clone, Debug, Default)]
 pub(super) struct ReadSummary {
     pub read_failed: usize,
     pub first_failure: Option<String>,
-    /// Paced replay: frames that came while the tracker was still busy.
+    /// Real time: frames that became due while the channel was full.
     pub late: usize,
 }
 
-/// Sends every frame that can be read, in order. Paced replay waits for each frame's time and never for the tracker.
+/// Sends every readable frame, in order. Real-time replay waits for each frame's timestamp and never blocks on the tracker.
 pub(super) fn read(sequence: &Sequence, paced: bool, sender: &Sender<Frame>, progress: &Progress) -> ReadSummary {
     let mut summary = ReadSummary::default();
     let started = Instant::now();

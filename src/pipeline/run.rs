@@ -1,157 +1,100 @@
-//! Starts the threads, waits for them, and gathers what they made.
+//! Starts the threads of a run, joins them, and gathers their results.
 
-use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::thread::{Builder, ScopedJoinHandle};
 use std::time::Instant;
 
 use crossbeam::channel::bounded;
 
-use super::checkpoint::Parts;
 use super::known_poses;
-use super::map_thread::{self, MapSummary};
-use super::measurements;
-use super::messages::guarded;
+use super::map_thread::{MapSummary, MapThread};
+use super::pose_feedback;
+use super::progress::guarded;
 use super::read_thread::{self, ReadSummary};
-use super::track_thread::{self, TrackSummary};
-use super::{Checkpoints, History, KeyframeRecord, PipelineError, Progress};
-use crate::config::Config;
-use crate::evaluation::image::WINDOW as SSIM_WINDOW;
-use crate::evaluation::{ExposureRecord, Exposures};
-use crate::geometry::{StampedPose, Trajectory};
+use super::track_thread::{TrackSummary, TrackThread};
+use super::{PipelineError, Progress};
 use crate::gpu::Gpu;
-use crate::sequence::{Sensor, Sequence};
-use crate::splat::GaussianCloud;
-use crate::tracking::KeyframePose;
+use crate::recording::Recording;
+use crate::run_folder::{Checkpointer, Elapsed, History, RunResult};
 
-/// Frames decoded ahead of the tracker; in paced replay those that are due and wait: the tracker may take long for one, a keyframe say, and
-/// catches up in the next ones.
+/// Frames decoded ahead of the tracker. In real time these are due frames that wait: a slow frame, of a keyframe say, costs none of the next.
 pub(super) const FRAMES_AHEAD: usize = 8;
-/// Keyframes and pose updates that may wait for the mapper. Few, so that the map never lags far behind the camera.
+/// Capacity of the mapper's channel: small, so that the map never lags far behind the camera.
 const MESSAGES_AHEAD: usize = 4;
 
-/// Everything that a replay made, whether or not it came to its end.
+/// A replay that has ended, early or not.
 #[derive(Debug)]
-pub struct Outcome {
-    pub cloud: Arc<GaussianCloud>,
-    /// `(frame index, pose)` of every tracked frame.
-    pub poses: Vec<(usize, StampedPose)>,
-    pub trajectory: Trajectory,
-    pub keyframes: Vec<KeyframePose>,
-    pub history: History,
-    pub frames_read_failed: usize,
-    pub frames_late: usize,
-    pub keyframes_deferred: usize,
-    pub tracking_ms: Vec<f64>,
-    pub step_ms: Vec<f64>,
-    /// All parts of a run that was resumed, as far as they came to a checkpoint.
-    pub wall_s: f64,
-    /// How often it went on from a checkpoint.
-    pub resumed: u64,
-    /// What ended the replay early.
+pub struct Replay {
+    /// Trajectory, map and records until the end.
+    pub result: RunResult,
+    /// What ended it early.
     pub error: Option<PipelineError>,
+    /// Whether [`Progress::stop`] ended it early.
+    pub stopped: bool,
 }
 
-impl Outcome {
-    pub fn keyframe_trajectory(&self) -> Trajectory {
-        Trajectory { poses: self.keyframes.iter().map(KeyframePose::stamped).collect() }
-    }
-
-    /// What the mapper found of the keyframes' exposures.
-    pub fn exposures(&self) -> Exposures {
-        exposures(&self.keyframes, &self.history.keyframes)
-    }
-}
-
-/// Exposures of mapped keyframes, at their times.
-pub(super) fn exposures(tracked: &[KeyframePose], mapped: &[KeyframeRecord]) -> Exposures {
-    let times: BTreeMap<usize, f64> = tracked.iter().map(|k| (k.id, k.timestamp_s)).collect();
-    let record = |KeyframeRecord { report, .. }: &KeyframeRecord| {
-        Some(ExposureRecord { timestamp_s: *times.get(&report.id)?, log_gain: report.exposure })
-    };
-    Exposures::new(mapped.iter().filter_map(record).collect())
-}
-
-/// Says before any work whether a map could be started from this sequence.
-pub fn check_first_depth(sequence: &Sequence) -> Result<(), PipelineError> {
-    match sequence.entries.first() {
-        Some(first) if sequence.sensor == Sensor::Rgbd && first.depth.is_none() => {
-            Err(PipelineError::NoFirstDepth { color: first.color.clone() })
-        }
-        _ => Ok(()),
-    }
-}
-
-/// Says before any work whether images at the mapping resolution are large enough to be compared.
-pub fn check_size(sequence: &Sequence, map_scale: f64) -> Result<(), PipelineError> {
-    let pinhole = sequence.camera.pinhole.scaled(map_scale);
-    let (width, height, least) = (pinhole.width, pinhole.height, SSIM_WINDOW as u32);
-    if width.min(height) < least { Err(PipelineError::TooSmall { width, height, least }) } else { Ok(()) }
-}
-
-/// Replays a sequence, from a checkpoint on if there is one. Errors that end it early are in the outcome, beside what was made until then.
+/// Replays a recording, from a checkpoint on if there is one. Errors that end it early are returned beside the partial result.
 ///
 /// # Errors
-/// If there is nothing for an outcome: threads that cannot be started, a checkpoint that the run does not come up to.
+/// If there is no result at all: a thread cannot be started, or the run does not reach its checkpoint.
 pub fn run(
-    sequence: &Sequence,
+    recording: &Recording,
     gpu: &Arc<Gpu>,
-    config: &Config,
     progress: &Progress,
-    checkpoints: Option<Checkpoints>,
-) -> Result<Outcome, PipelineError> {
+    checkpointer: Option<Checkpointer>,
+) -> Result<Replay, PipelineError> {
     let started = Instant::now();
-    let mut parts = checkpoints.as_ref().map_or_else(Parts::default, Checkpoints::earlier);
+    let mut elapsed = checkpointer.as_ref().map_or_else(Elapsed::default, Checkpointer::earlier);
+    let config = recording.config();
     let paced = config.replay.paced;
     let (frame_sender, frames) = bounded(FRAMES_AHEAD);
     let waiting = paced.then(|| frames.clone());
     let (message_sender, messages) = bounded(MESSAGES_AHEAD);
-    let (teller, listener) = measurements::channel(config);
-    let mapping = &known_poses::mapping_config(sequence, config);
+    let (feedback_sender, feedback) = pose_feedback::channel(config);
+    let mapping = &known_poses::mapping_config(recording);
     let (read, track, map) = std::thread::scope(|scope| {
         let spawn_error = |thread| move |source| PipelineError::Spawn { thread, source };
         // A thread that cannot start drops its end of the channels, and the others end with it.
         let map = Builder::new()
             .name("mapping".into())
             .spawn_scoped(scope, move || {
-                map_thread::map(gpu, mapping, (&messages, waiting.as_ref()), &teller, (progress, &mut |_| ()), checkpoints)
+                let (messages, frames) = (&messages, waiting.as_ref());
+                MapThread { gpu, config: mapping, messages, frames, feedback: &feedback_sender, progress }
+                    .map(&mut |_| (), checkpointer)
             })
             .map_err(spawn_error("mapping"))?;
         let track = Builder::new()
             .name("tracking".into())
             .spawn_scoped(scope, move || {
-                if config.replay.known_poses {
-                    known_poses::follow(sequence, config, &frames, &message_sender, progress)
-                } else {
-                    track_thread::track(sequence, config, &frames, &message_sender, listener, progress)
-                }
+                let thread = TrackThread { recording, frames: &frames, mapper: &message_sender, progress };
+                if config.replay.known_poses { known_poses::follow(&thread) } else { thread.track(feedback) }
             })
             .map_err(spawn_error("tracking"))?;
         let read = Builder::new()
             .name("reading".into())
-            .spawn_scoped(scope, move || read_thread::read(sequence, paced, &frame_sender, progress))
+            .spawn_scoped(scope, move || read_thread::read(recording.sequence(), paced, &frame_sender, progress))
             .map_err(spawn_error("reading"))?;
         Ok::<_, PipelineError>((join("reading", read), join("tracking", track), join("mapping", map)))
     })?;
     if let Ok(MapSummary { behind: true, error, .. }) = map {
         let cause = track.map_or_else(Some, |track| track.error);
-        return Err(cause.or(error).expect("who falls behind says why"));
+        return Err(cause.or(error).expect("a run that falls behind has an error"));
     }
-    parts.wall_s += started.elapsed().as_secs_f64();
-    Ok(outcome(sequence, parts, read, track, map))
+    elapsed.wall_s += started.elapsed().as_secs_f64();
+    Ok(Replay { stopped: progress.stopped(), ..gather(recording, elapsed, read, track, map) })
 }
 
 fn join<T>(thread: &'static str, handle: ScopedJoinHandle<'_, T>) -> Result<T, PipelineError> {
     guarded(thread, || Ok(handle.join().unwrap_or_else(|payload| std::panic::resume_unwind(payload))))
 }
 
-fn outcome(
-    sequence: &Sequence,
-    Parts { wall_s, resumed }: Parts,
+fn gather(
+    recording: &Recording,
+    Elapsed { wall_s, resumed }: Elapsed,
     read: Result<ReadSummary, PipelineError>,
     track: Result<TrackSummary, PipelineError>,
     map: Result<MapSummary, PipelineError>,
-) -> Outcome {
+) -> Replay {
     let mut errors = Vec::new();
     let read = read.unwrap_or_else(|error| {
         errors.push(error);
@@ -159,14 +102,14 @@ fn outcome(
     });
     let map = map.unwrap_or_else(|error| MapSummary { error: Some(error), ..MapSummary::default() });
     let track = track.unwrap_or_else(|error| TrackSummary { error: Some(error), ..TrackSummary::default() });
-    let frames = sequence.entries.len();
+    let frames = recording.sequence().entries.len();
     if let Some(first) = read.first_failure.filter(|_| read.read_failed == frames) {
         errors.push(PipelineError::NothingRead { frames, first });
     }
     let trajectory = track.stamped();
     errors.extend(track.error);
     errors.extend(map.error);
-    Outcome {
+    let result = RunResult {
         cloud: map.cloud,
         poses: track.trajectory,
         trajectory,
@@ -179,6 +122,6 @@ fn outcome(
         step_ms: map.step_ms,
         wall_s,
         resumed,
-        error: errors.into_iter().next(),
-    }
+    };
+    Replay { result, error: errors.into_iter().next(), stopped: false }
 }

@@ -1,33 +1,34 @@
-//! Tracks frames and hands keyframes on to the mapper.
+//! The tracking thread: tracks frames and sends keyframes to the mapper.
 
 use crossbeam::channel::{Receiver, Sender, TrySendError};
 
-use super::measurements::Listener;
-use super::messages::{TrackingProgress, guarded};
-use super::{FrameRecord, MapperMessage, PipelineError, Progress};
-use crate::config::Config;
+use super::pose_feedback::PoseFeedbackReceiver;
+use super::progress::{TrackingProgress, guarded};
+use super::{PipelineError, Progress};
 use crate::geometry::{StampedPose, Trajectory};
-use crate::mapping::{DepthSource, Keyframe, RightImage};
-use crate::sequence::{Frame, Rectifier, Sensor, Sequence};
+use crate::mapping::{DepthSource, Keyframe, MapperMessage, RightImage};
+use crate::recording::Recording;
+use crate::run_folder::FrameRecord;
+use crate::sequence::{Frame, Rectifier, Sensor};
 use crate::tracking::{KeyframePose, NewKeyframe, TrackedFrame, Tracker, TrackingState};
 
-/// What tracking came to, also when it ended early.
+/// Result of the tracking thread, also when it ended early.
 #[derive(Debug, Default)]
 pub(super) struct TrackSummary {
     /// `(frame index, pose)` of every tracked frame, finally corrected.
     pub trajectory: Vec<(usize, StampedPose)>,
     pub keyframes: Vec<KeyframePose>,
     pub frames: Vec<FrameRecord>,
-    /// Paced replay: keyframes that the mapper never got.
+    /// Real time: keyframes that the mapper never received.
     pub deferred: usize,
     pub error: Option<PipelineError>,
 }
 
-/// The way to the mapper, with its overflow policy.
+/// The channel to the mapper, with its overflow policy.
 pub(super) struct KeyframeSender<'a> {
     sender: &'a Sender<MapperMessage>,
     paced: bool,
-    /// Paced: the newest keyframe that found the channel full.
+    /// Real time: the newest keyframe that found the channel full.
     waiting: Option<MapperMessage>,
     deferred: usize,
 }
@@ -37,7 +38,7 @@ impl<'a> KeyframeSender<'a> {
         Self { sender, paced, waiting: None, deferred: 0 }
     }
 
-    /// Says whether the mapper still listens.
+    /// Sends a message; `false` if the mapper has closed the channel.
     pub fn send(&mut self, message: MapperMessage) -> bool {
         if !self.paced {
             return self.sender.send(message).is_ok();
@@ -45,7 +46,7 @@ impl<'a> KeyframeSender<'a> {
         let is_keyframe = matches!(message, MapperMessage::Keyframe(_));
         match self.sender.try_send(message) {
             Ok(()) => true,
-            // A pose update that finds no room is followed by a newer one.
+            // A pose update that finds the channel full is followed by a newer one.
             Err(TrySendError::Full(_)) if !is_keyframe => true,
             Err(TrySendError::Full(message)) => {
                 self.deferred += usize::from(self.waiting.replace(message).is_some());
@@ -55,6 +56,7 @@ impl<'a> KeyframeSender<'a> {
         }
     }
 
+    /// Sends the keyframe that waits, if any; `false` if the mapper has closed the channel.
     pub fn retry(&mut self) -> bool {
         match self.waiting.take() {
             Some(message) => self.send(message),
@@ -62,7 +64,7 @@ impl<'a> KeyframeSender<'a> {
         }
     }
 
-    /// Sends the last keyframe, which has no newer one to give way to; returns how many the mapper never got.
+    /// Sends the keyframe that waits, which no newer one replaces; returns the number of keyframes that the mapper never received.
     pub fn finish(self) -> usize {
         if let Some(message) = self.waiting {
             let _ = self.sender.send(message);
@@ -71,75 +73,76 @@ impl<'a> KeyframeSender<'a> {
     }
 }
 
-/// Tracks until the frames end, an error, or the mapper stops listening.
-pub(super) fn track(
-    sequence: &Sequence,
-    config: &Config,
-    frames: &Receiver<Frame>,
-    mapper: &Sender<MapperMessage>,
-    mut listener: Listener,
-    progress: &Progress,
-) -> TrackSummary {
-    let mut summary = TrackSummary::default();
-    let mut tracker = match Tracker::new(sequence.camera, sequence.sensor, &config.tracking) {
-        Ok(tracker) => tracker.paced(config.replay.paced),
-        Err(error) => return TrackSummary { error: Some(error.into()), ..summary },
-    };
-    let rectifier = Rectifier::new(&sequence.camera, config.map_scale);
-    let mut sender = KeyframeSender::new(mapper, config.replay.paced);
-    for frame in frames {
-        let may_be_keyframe = !config.replay.is_held_out(frame.index);
-        let tracked = match guarded("tracking", || Ok(tracker.track(&frame, may_be_keyframe)?)) {
-            Ok(tracked) => tracked,
-            Err(error) => {
-                summary.error = Some(error);
-                break;
-            }
-        };
-        let lost = tracked.state == TrackingState::Lost;
-        summary.frames.push(FrameRecord { frame: frame.index, lost, times: tracked.times });
-        let (frames_done, keyframes) = (frame.index + 1, tracker.keyframes().len());
-        progress.tracking.force_push(TrackingProgress { frames_done, keyframes, lost });
-        let keyframe = tracked.keyframe.as_ref().map(|k| k.id);
-        if !sender.retry() || !hand_on(&mut sender, (&rectifier, sequence.sensor), &frame, tracked) {
-            break;
-        }
-        if let Err(error) = tracker.measure(&listener.hear(keyframe)) {
-            summary.error = Some(error.into());
-            break;
-        }
-    }
-    // What is still under way; its updates are part of the last word.
-    if let Err(error) = guarded("tracking", || Ok(tracker.finish()?)) {
-        summary.error.get_or_insert(error);
-    }
-    summary.deferred = sender.finish();
-    summary.trajectory = tracker.trajectory();
-    summary.keyframes = tracker.keyframes();
-    let last_word = summary.keyframes.iter().map(|k| (k.id, k.world_from_camera)).collect();
-    let _ = mapper.send(MapperMessage::PoseUpdate(last_word));
-    summary
+/// Input of the tracking thread.
+#[derive(Clone, Copy)]
+pub(super) struct TrackThread<'a> {
+    pub recording: &'a Recording,
+    pub frames: &'a Receiver<Frame>,
+    pub mapper: &'a Sender<MapperMessage>,
+    pub progress: &'a Progress,
 }
 
-fn hand_on(
-    sender: &mut KeyframeSender<'_>,
-    (rectifier, sensor): (&Rectifier, Sensor),
-    frame: &Frame,
-    tracked: TrackedFrame,
-) -> bool {
-    if !tracked.updates.is_empty() && !sender.send(MapperMessage::PoseUpdate(tracked.updates)) {
-        return false;
+impl TrackThread<'_> {
+    /// Tracks until the frames end, an error occurs, or the mapper closes the channel.
+    pub fn track(&self, mut feedback: PoseFeedbackReceiver) -> TrackSummary {
+        let (sequence, config) = (self.recording.sequence(), self.recording.config());
+        let mut summary = TrackSummary::default();
+        let mut tracker = match Tracker::new(sequence.camera, sequence.sensor, &config.tracking) {
+            Ok(tracker) => tracker.paced(config.replay.paced),
+            Err(error) => return TrackSummary { error: Some(error.into()), ..summary },
+        };
+        let rectifier = Rectifier::new(&sequence.camera, config.map_scale);
+        let mut keyframes = KeyframeSender::new(self.mapper, config.replay.paced);
+        for frame in self.frames {
+            let may_be_keyframe = !config.replay.is_held_out(frame.index);
+            let tracked = match guarded("tracking", || Ok(tracker.track(&frame, may_be_keyframe)?)) {
+                Ok(tracked) => tracked,
+                Err(error) => {
+                    summary.error = Some(error);
+                    break;
+                }
+            };
+            let lost = tracked.state == TrackingState::Lost;
+            summary.frames.push(FrameRecord { frame: frame.index, lost, times: tracked.times });
+            let progress = TrackingProgress { frames_done: frame.index + 1, keyframes: tracker.keyframes().len(), lost };
+            self.progress.tracking.force_push(progress);
+            let keyframe = tracked.keyframe.as_ref().map(|k| k.id);
+            if !keyframes.retry() || !self.send(&mut keyframes, &rectifier, &frame, tracked) {
+                break;
+            }
+            if let Err(error) = tracker.measure(&feedback.receive(keyframe)) {
+                summary.error = Some(error.into());
+                break;
+            }
+        }
+        // The adjustment in flight; its updates are part of the final pose update.
+        if let Err(error) = guarded("tracking", || Ok(tracker.finish()?)) {
+            summary.error.get_or_insert(error);
+        }
+        summary.deferred = keyframes.finish();
+        summary.trajectory = tracker.trajectory();
+        summary.keyframes = tracker.keyframes();
+        let final_poses = summary.keyframes.iter().map(|k| (k.id, k.world_from_camera)).collect();
+        let _ = self.mapper.send(MapperMessage::PoseUpdate(final_poses));
+        summary
     }
-    let Some(NewKeyframe { id, world_from_camera, seen, covisible }) = tracked.keyframe else { return true };
-    let mut image = rectifier.rectify(frame);
-    let mut depth_source = DepthSource::Sensor;
-    if image.depth.is_none() && !seen.is_empty() {
-        image.depth = Some(rectifier.sparse_depth(&seen));
-        depth_source = DepthSource::Landmarks { right: right_image(rectifier, sensor, frame) };
+
+    /// Sends a frame's pose updates and keyframe; `false` if the mapper has closed the channel.
+    fn send(&self, keyframes: &mut KeyframeSender<'_>, rectifier: &Rectifier, frame: &Frame, tracked: TrackedFrame) -> bool {
+        if !tracked.updates.is_empty() && !keyframes.send(MapperMessage::PoseUpdate(tracked.updates)) {
+            return false;
+        }
+        let Some(NewKeyframe { id, world_from_camera, seen, covisible }) = tracked.keyframe else { return true };
+        let mut image = rectifier.rectify(frame);
+        let mut depth_source = DepthSource::Sensor;
+        if image.depth.is_none() && !seen.is_empty() {
+            image.depth = Some(rectifier.sparse_depth(&seen));
+            depth_source = DepthSource::Landmarks { right: right_image(rectifier, self.recording.sequence().sensor, frame) };
+        }
+        let covisible = covisible.into_iter().map(|(id, _)| id).collect();
+        let keyframe = Keyframe { id, world_from_camera, image, depth_source, covisible };
+        keyframes.send(MapperMessage::Keyframe(Box::new(keyframe)))
     }
-    let covisible = covisible.into_iter().map(|(id, _)| id).collect();
-    let keyframe = Keyframe { id, world_from_camera, image, depth_source, covisible };
-    sender.send(MapperMessage::Keyframe(Box::new(keyframe)))
 }
 
 fn right_image(rectifier: &Rectifier, sensor: Sensor, frame: &Frame) -> Option<RightImage> {

@@ -10,8 +10,8 @@ use std::path::{Path, PathBuf};
 use serde::de::DeserializeOwned;
 
 use crate::evaluation::{Comparison, Metrics};
-use crate::export::{ExportError, write_atomically};
-use crate::pipeline::{History, outputs};
+use crate::files::{WriteError, write_atomically};
+use crate::run_folder::{History, outputs};
 
 /// The report's name in the run's folder.
 pub const REPORT: &str = "report.html";
@@ -25,7 +25,7 @@ pub enum ReportError {
     #[error("cannot draw: {0}; please report this")]
     Drawing(String),
     #[error(transparent)]
-    Export(#[from] ExportError),
+    Write(#[from] WriteError),
 }
 
 /// What a folder holds of a run.

@@ -7,7 +7,7 @@ use base64::engine::general_purpose::STANDARD;
 
 use super::{ReportError, Run, plots};
 use crate::evaluation::Metrics;
-use crate::pipeline::outputs;
+use crate::run_folder::outputs;
 
 const TEMPLATE: &str = include_str!("page.html");
 /// Held-out views in the page: so many, evenly spread, and the worst.

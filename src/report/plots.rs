@@ -6,7 +6,7 @@ use plotters::coord::Shift;
 use plotters::prelude::*;
 
 use crate::evaluation::Comparison;
-use crate::pipeline::{FrameRecord, KeyframeRecord};
+use crate::run_folder::{FrameRecord, KeyframeRecord};
 
 type Drawn = Result<(), Box<dyn std::error::Error>>;
 type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;

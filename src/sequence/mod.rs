@@ -13,7 +13,6 @@ mod parsing;
 mod rectify;
 mod replica;
 mod stereo;
-pub mod synthetic;
 mod transforms;
 mod tum;
 mod video;

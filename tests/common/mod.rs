@@ -7,9 +7,9 @@ pub mod recording;
 use fastrand::Rng;
 use glam::{Quat, Vec3};
 use keysplat::geometry::{Pinhole, se3};
-use keysplat::reference::{Image64, ImageGradient64};
 use keysplat::splat::ViewCamera;
 use keysplat::splat::{Gaussian, GaussianCloud, ShDegree};
+use keysplat::verification::reference::{Image64, ImageGradient64};
 use nalgebra::{Vector3, Vector6};
 
 pub fn between(rng: &mut Rng, low: f32, high: f32) -> f32 {

@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 
 use keysplat::evaluation::Metrics;
 use keysplat::gpu::Gpu;
-use keysplat::sequence::synthetic::{self, CameraConfig, FurnitureConfig, SceneConfig};
+use keysplat::synthetic::{self, CameraConfig, FurnitureConfig, SceneConfig};
 
 pub const FRAMES: usize = 24;
 pub const FPS: f64 = 30.0;

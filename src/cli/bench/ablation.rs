@@ -4,16 +4,14 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use clap::Args;
-use keysplat::config::Config;
 use keysplat::evaluation::metrics::ImageFigures;
-use keysplat::evaluation::views::{ViewSelection, evaluate_views};
-use keysplat::gpu::Gpu;
-use keysplat::pipeline::{self, Mapped, Progress, Recording};
-use keysplat::sequence::Sequence;
+use keysplat::evaluation::views::{ViewSelection, ViewSource, evaluate_views};
+use keysplat::pipeline::{MappedLog, TrackedLog};
+use keysplat::{Config, Gpu, Progress, Recording};
 use miette::IntoDiagnostic;
 use serde::Serialize;
 
-use super::super::run::{self, RunArgs};
+use super::super::run::RunArgs;
 
 #[derive(Args)]
 pub(super) struct AblationArgs {
@@ -54,15 +52,15 @@ struct Row {
 }
 
 impl Row {
-    fn new(variant: &Variant, iterations_per_keyframe: usize, mapped: &Mapped, held_out: Option<ImageFigures>) -> Self {
+    fn new(variant: &Variant, iterations_per_keyframe: usize, mapped: &MappedLog, held_out: Option<ImageFigures>) -> Self {
         let (mapping_s, steps, gaussians) = (mapped.wall_s, mapped.steps, mapped.cloud.len());
         Self { variant: variant.name.clone(), iterations_per_keyframe, mapping_s, steps, gaussians, held_out }
     }
 }
 
 pub(super) fn ablation(args: &AblationArgs) -> miette::Result<()> {
-    let mut base = args.run.resolve()?;
-    let sequence = run::open(&mut base)?;
+    let recording = Recording::open(args.run.resolve()?).into_diagnostic()?;
+    let base = recording.config();
     let given = Variant { name: "as given".into(), settings: Vec::new() };
     let variants = if args.variants.is_empty() { std::slice::from_ref(&given) } else { &args.variants };
     // A wrong setting is told before anything is done.
@@ -70,7 +68,7 @@ pub(super) fn ablation(args: &AblationArgs) -> miette::Result<()> {
         variants.iter().map(|v| base.with_settings(&v.settings)).collect::<Result<_, _>>().into_diagnostic()?;
     std::fs::create_dir_all(&args.run.out).into_diagnostic()?;
     let gpu = Gpu::open(base.adapter.as_deref()).into_diagnostic()?;
-    let recording = pipeline::record(&sequence, &base, &Progress::default()).into_diagnostic()?;
+    let log = TrackedLog::record(&recording, &Progress::default()).into_diagnostic()?;
     println!("| variant | steps/keyframe | mapping s | steps | Gaussians | held-out PSNR dB | SSIM | depth L1 cm |");
     println!("|---|---|---|---|---|---|---|---|");
     let mut rows = Vec::new();
@@ -79,22 +77,22 @@ pub(super) fn ablation(args: &AblationArgs) -> miette::Result<()> {
         for &iterations in if args.iterations.is_empty() { &own } else { args.iterations.as_slice() } {
             let mut config = config.clone();
             config.mapping.iterations_per_keyframe = iterations;
-            let mut row = |mapped: &Mapped| -> miette::Result<()> {
-                let held_out = held_out((&sequence, &config), &gpu, &recording, mapped);
+            let mut row = |mapped: &MappedLog| -> miette::Result<()> {
+                let held_out = held_out(&recording, &log, &gpu, mapped);
                 rows.push(Row::new(variant, iterations, mapped, held_out?));
                 print(rows.last().expect("one was pushed"));
                 Ok(())
             };
             let every = args.rows_every.unwrap_or(usize::MAX).max(1);
             let (mut next, mut last, mut failed) = (every, 0, Ok(()));
-            let mut on_round = |mapped: Mapped| {
+            let mut on_round = |mapped: MappedLog| {
                 if mapped.steps >= next && failed.is_ok() {
                     next = (mapped.steps / every + 1).saturating_mul(every);
                     last = mapped.steps;
                     failed = row(&mapped);
                 }
             };
-            let mapped = recording.map(&gpu, &config.mapping, &Progress::default(), &mut on_round).into_diagnostic()?;
+            let mapped = log.map(&gpu, &config.mapping, &Progress::default(), &mut on_round).into_diagnostic()?;
             failed?;
             if mapped.steps != last {
                 row(&mapped)?;
@@ -102,23 +100,19 @@ pub(super) fn ablation(args: &AblationArgs) -> miette::Result<()> {
         }
     }
     let text = serde_json::to_string_pretty(&rows).into_diagnostic()?;
-    keysplat::export::write_atomically(&args.run.out.join("ablation.json"), text.as_bytes()).into_diagnostic()?;
+    keysplat::files::write_atomically(&args.run.out.join("ablation.json"), text.as_bytes()).into_diagnostic()?;
     Ok(())
 }
 
-/// The held-out views of a map.
-fn held_out(
-    (sequence, config): (&Sequence, &Config),
-    gpu: &Arc<Gpu>,
-    recording: &Recording,
-    Mapped { cloud, exposures, .. }: &Mapped,
-) -> miette::Result<Option<ImageFigures>> {
+/// Figures of a map's held-out views.
+fn held_out(recording: &Recording, log: &TrackedLog, gpu: &Arc<Gpu>, mapped: &MappedLog) -> miette::Result<Option<ImageFigures>> {
+    let config = recording.config();
     let is_held_out = |index: usize| config.replay.is_held_out(index);
-    let poses: Vec<_> = recording.poses.iter().filter(|(index, _)| is_held_out(*index)).copied().collect();
+    let poses: Vec<_> = log.poses().iter().filter(|(index, _)| is_held_out(*index)).copied().collect();
+    let MappedLog { cloud, exposures, .. } = mapped;
     let selection = ViewSelection { poses: &poses, keyframes: &BTreeSet::new(), is_held_out: &is_held_out, exposures };
-    let images =
-        evaluate_views((sequence, config.map_scale), (gpu, cloud), &selection, &mut |_| (), &|_| ()).into_diagnostic()?;
-    Ok(images.held_out)
+    let source = ViewSource { sequence: recording.sequence(), map_scale: config.map_scale, gpu, cloud };
+    Ok(evaluate_views(source, &selection, &mut |_| (), &|_| ()).into_diagnostic()?.held_out)
 }
 
 fn print(row: &Row) {

@@ -5,15 +5,15 @@ use std::process::{Command, Stdio};
 
 use clap::{Args, ValueEnum};
 use keysplat::evaluation::{Metrics, machine};
-use keysplat::export::write_atomically;
-use keysplat::pipeline::outputs;
+use keysplat::files::write_atomically;
+use keysplat::presets::Preset;
 use keysplat::report::curves;
 use keysplat::report::sweep::{Sweep, SweepRow, Verdict, compare as changes, points, to_csv, to_markdown, with_spread};
-use keysplat::sequence::synthetic::SceneConfig;
+use keysplat::run_folder::outputs;
+use keysplat::synthetic::SceneConfig;
 use miette::{IntoDiagnostic, miette};
 
 use super::ablation::{Variant, parse_variant};
-use crate::cli::run::BudgetName;
 use crate::cli::{Verbosity, generate, print, progress};
 
 /// Scenes that need no recording.
@@ -24,7 +24,7 @@ const SCENES: [(&str, &str); 3] = [
 ];
 /// What made a run, in its folder: a run of the same is not made again.
 const MADE_BY: &str = "made-by.json";
-/// Where neither numbers of steps nor budgets are asked for.
+/// Where neither numbers of steps nor presets are asked for.
 const USUAL_STEPS: [usize; 4] = [12, 25, 50, 100];
 
 #[derive(Args)]
@@ -35,16 +35,16 @@ pub(super) struct SweepArgs {
     /// Folder for all runs, sweep.csv, sweep.json, sweep.md and curves.svg; a sweep that was interrupted goes on there.
     #[arg(short, long)]
     out: PathBuf,
-    /// Steps after each keyframe: each number is a point of the curves. 12, 25, 50 and 100 if there are no budgets either.
+    /// Steps after each keyframe: each number is a point of the curves. 12, 25, 50 and 100 if there are no presets either.
     #[arg(long, value_delimiter = ',')]
     iterations: Vec<usize>,
-    /// Budgets of `keysplat run`: each is a point of the curves, with its own number of steps, or with all of --iterations.
+    /// Presets of `keysplat run`: each is a point of the curves, with its own number of steps, or with all of --iterations.
     #[arg(long, value_delimiter = ',', value_enum)]
-    budgets: Vec<BudgetName>,
+    presets: Vec<Preset>,
     /// Seeds: each point is run with all of them.
     #[arg(long, value_delimiter = ',', default_values_t = [0u64])]
     seeds: Vec<u64>,
-    /// A variant: its name and the settings in which it differs, run with all budgets and numbers of steps (may be given again).
+    /// A variant: its name and the settings in which it differs, run with all presets and numbers of steps (may be given again).
     #[arg(long = "variant", value_name = "NAME: KEY=VALUE …", value_parser = parse_variant)]
     variants: Vec<Variant>,
     /// Options of `keysplat run` for all runs, e.g. -- --map-scale 0.5 --frames 0..200
@@ -103,26 +103,26 @@ pub(super) fn sweep(args: &SweepArgs, verbosity: Verbosity) -> miette::Result<()
     print(&table)
 }
 
-/// The runs that each sequence and seed gets, name and options: each variant with each budget and each number of steps.
+/// The runs that each sequence and seed gets, name and options: each variant with each preset and each number of steps.
 fn settings(args: &SweepArgs) -> Vec<(String, Vec<String>)> {
     let plain = [Variant { name: String::new(), settings: Vec::new() }];
     let variants = if args.variants.is_empty() { &plain[..] } else { &args.variants };
-    let mut budgets: Vec<_> = args.budgets.iter().copied().map(Some).collect();
+    let mut presets: Vec<_> = args.presets.iter().copied().map(Some).collect();
     let mut steps: Vec<_> = args.iterations.iter().copied().map(Some).collect();
     if steps.is_empty() {
-        steps = if budgets.is_empty() { USUAL_STEPS.map(Some).to_vec() } else { vec![None] };
+        steps = if presets.is_empty() { USUAL_STEPS.map(Some).to_vec() } else { vec![None] };
     }
-    if budgets.is_empty() {
-        budgets.push(None);
+    if presets.is_empty() {
+        presets.push(None);
     }
     let mut settings = Vec::new();
     for variant in variants {
-        for budget in budgets.iter().map(|budget| budget.and_then(|b| b.to_possible_value())) {
+        for preset in presets.iter().map(|preset| preset.and_then(|b| b.to_possible_value())) {
             for steps in &steps {
-                let budget = budget.as_ref().map(|value| value.get_name().to_owned());
+                let preset = preset.as_ref().map(|value| value.get_name().to_owned());
                 let variant_name = Some(variant.name.clone()).filter(|name| !name.is_empty());
-                let names = [variant_name, budget.clone(), steps.map(|n| format!("{n} steps"))];
-                let mut options = budget.map_or_else(Vec::new, |name| vec!["--budget".into(), name]);
+                let names = [variant_name, preset.clone(), steps.map(|n| format!("{n} steps"))];
+                let mut options = preset.map_or_else(Vec::new, |name| vec!["--preset".into(), name]);
                 let of_steps = steps
                     .map(|n| [format!("mapping.iterations_per_keyframe={n}"), format!("mapping.first_iterations={}", 2 * n)]);
                 for setting in of_steps.into_iter().flatten().chain(variant.settings.clone()) {

@@ -1,20 +1,22 @@
-//! A digest of all that the mapper has been told: by it a resumed run knows that the recording and the tracker are what they were.
+//! A digest of the mapper's input: a resumed run compares it to verify that recording and tracking have repeated.
 
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-use super::MapperMessage;
+use crate::mapping::MapperMessage;
 
-/// Of the messages so far.
+/// Running SHA-256 over the messages so far.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub(super) struct Heard {
+pub(crate) struct MessageDigest {
+    /// Messages so far.
     pub messages: usize,
     /// Each is that of the one before and the message.
     digest: [u8; 32],
 }
 
-impl Heard {
-    pub fn hear(&mut self, message: &MapperMessage) {
+impl MessageDigest {
+    /// Appends one message.
+    pub fn update(&mut self, message: &MapperMessage) {
         let mut digest = Sha256::new_with_prefix(self.digest);
         match message {
             MapperMessage::Points(points) => points.iter().for_each(|point| {
@@ -44,17 +46,17 @@ mod tests {
 
     #[test]
     fn order_and_every_bit_count() {
-        let update = |id, x| MapperMessage::PoseUpdate(vec![(id, Se3::translation(x, 0.0, 0.0))]);
-        let heard = |messages: &[MapperMessage]| {
-            let mut heard = Heard::default();
-            messages.iter().for_each(|message| heard.hear(message));
-            heard
+        let pose_update = |id, x| MapperMessage::PoseUpdate(vec![(id, Se3::translation(x, 0.0, 0.0))]);
+        let digest_of = |messages: &[MapperMessage]| {
+            let mut digest = MessageDigest::default();
+            messages.iter().for_each(|message| digest.update(message));
+            digest
         };
-        let one = heard(&[update(1, 0.5), update(2, 0.5)]);
-        assert_eq!(one, heard(&[update(1, 0.5), update(2, 0.5)]));
+        let one = digest_of(&[pose_update(1, 0.5), pose_update(2, 0.5)]);
+        assert_eq!(one, digest_of(&[pose_update(1, 0.5), pose_update(2, 0.5)]));
         assert_eq!(one.messages, 2);
-        for other in [[update(2, 0.5), update(1, 0.5)], [update(1, 0.5), update(2, 0.5f64.next_up())]] {
-            assert_ne!(one.digest, heard(&other).digest);
+        for other in [[pose_update(2, 0.5), pose_update(1, 0.5)], [pose_update(1, 0.5), pose_update(2, 0.5f64.next_up())]] {
+            assert_ne!(one.digest, digest_of(&other).digest);
         }
     }
 }

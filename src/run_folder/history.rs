@@ -1,11 +1,11 @@
-//! How a run went, frame by frame and keyframe by keyframe: `history.json`, which `keysplat report` draws.
+//! `history.json`: records of each tracked frame and each mapped keyframe, which `keysplat report` plots.
 
 use serde::{Deserialize, Serialize};
 
 use crate::mapping::KeyframeReport;
 use crate::tracking::StageTimes;
 
-/// A run's course.
+/// Records of a run.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct History {
     /// In the order in which they were tracked.
@@ -14,28 +14,31 @@ pub struct History {
     pub keyframes: Vec<KeyframeRecord>,
 }
 
-/// What the tracker did with a frame.
+/// One tracked frame.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct FrameRecord {
     /// Its index in the sequence as replayed.
     pub frame: usize,
+    /// Whether it has no pose.
     pub lost: bool,
+    /// Time of each tracking stage.
     #[serde(flatten)]
     pub times: StageTimes,
 }
 
-/// What the mapper did with a keyframe.
+/// One mapped keyframe.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct KeyframeRecord {
+    /// Figures of the mapper.
     #[serde(flatten)]
     pub report: KeyframeReport,
-    /// When it was done, since the start of the mapper.
+    /// When it was finished, seconds since the mapper's start.
     pub done_s: f64,
-    /// What it took.
+    /// Duration, seconds.
     pub busy_s: f64,
-    /// Messages that waited for the mapper when it began.
+    /// Messages in the mapper's channel when it began.
     pub waiting: usize,
-    /// Resident memory of the process when it was done, where the system tells.
+    /// Resident memory of the process when it was finished, bytes; absent where the system does not report it.
     #[serde(default)]
     pub host_bytes: Option<u64>,
 }

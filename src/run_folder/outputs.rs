@@ -1,4 +1,4 @@
-//! The run's folder: trajectories, map, configuration, pictures, figures. What can be lost least is written first.
+//! Files of a run: trajectories, map, configuration, pictures, metrics. The least replaceable are written first.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -7,56 +7,97 @@ use std::sync::Arc;
 use image::{GenericImage, RgbImage};
 use serde::Serialize;
 
-use super::{FolderLock, Outcome};
-use crate::config::Config;
-use crate::evaluation::metrics::{Adapter, AteFigures, MappingFigures, Metrics, RpeFigures, Times, UsualTimes};
-use crate::evaluation::views::{ComparedView, ViewSelection, evaluate_views};
+use super::{FolderLock, RunResult};
+use crate::evaluation::metrics::{Adapter, AteFigures, ImageProtocols, MappingFigures, Metrics, RpeFigures, Times, UsualTimes};
+use crate::evaluation::views::{ComparedView, ViewSelection, ViewSource, evaluate_views};
 use crate::evaluation::{
     Alignment, Comparison, Exposures, draw_trajectory, evaluate_trajectory, machine, sha256_hex, write_json,
 };
-use crate::export::{ExportError, MapFormat, remove_partials, write_atomically};
+use crate::export::{ExportError, MapFormat};
+use crate::files::{WriteError, remove_partials, write_atomically};
 use crate::geometry::{Se3, Trajectory};
 use crate::gpu::{Gpu, GpuError};
-use crate::sequence::{SensorKind, Sequence};
+use crate::recording::Recording;
+use crate::sequence::SensorKind;
 use crate::splat::GaussianCloud;
 
-/// Names in the run's folder.
+/// Poses of all tracked frames, TUM format.
 pub const TRAJECTORY: &str = "trajectory.txt";
+/// Poses of the keyframes, TUM format.
 pub const KEYFRAMES: &str = "keyframes.txt";
+/// The Gaussian map.
 pub const MAP: &str = "map.ply";
+/// Accuracy, times and memory.
 pub const METRICS: &str = "metrics.json";
+/// The resolved configuration.
 pub const CONFIG: &str = "config.toml";
+/// Folder of held-out views beside their renders.
 pub const VIEWS: &str = "views";
+/// Estimated and true path, and the error over time.
 pub const DRAWING: &str = "trajectory.svg";
+/// Records of frames and keyframes.
 pub const HISTORY: &str = "history.json";
+/// Errors of each pose and each held-out view.
 pub const COMPARISON: &str = "comparison.json";
-/// Of the keyframes, if exposures are corrected.
+/// Exposures of the keyframes, where they are estimated.
 pub const EXPOSURES: &str = "exposures.json";
-/// Until the run is finished, and if it keeps any.
+/// State to resume from; absent after the run's end.
 pub const CHECKPOINT: &str = "checkpoint.bin";
 
 /// At most this many held-out views are kept as pictures, spread evenly.
 const MAX_PICTURES: usize = 100;
 
+/// An output that could not be made.
 #[derive(Debug, thiserror::Error)]
 pub enum OutputError {
+    /// The folder cannot be created.
     #[error("cannot create the output folder {path}: {source}; choose another with --out")]
-    Folder { path: PathBuf, source: std::io::Error },
+    Folder {
+        /// Its path.
+        path: PathBuf,
+        /// The cause.
+        source: std::io::Error,
+    },
+    /// Another process holds its lock.
     #[error("another keysplat is at work in {path}; wait until it has ended, or choose another folder")]
-    Busy { path: PathBuf },
+    Busy {
+        /// Its path.
+        path: PathBuf,
+    },
+    /// An earlier file cannot be removed.
     #[error("cannot remove {path}, which is of an earlier run: {source}; choose another folder with --out")]
-    Remove { path: PathBuf, source: std::io::Error },
+    Remove {
+        /// Its path.
+        path: PathBuf,
+        /// The cause.
+        source: std::io::Error,
+    },
+    /// The plotting library failed.
     #[error("cannot draw the trajectory: {0}; please report this")]
     Drawing(String),
+    /// A picture cannot be encoded.
     #[error("cannot encode {path}: {source}")]
-    Picture { path: PathBuf, source: image::ImageError },
+    Picture {
+        /// Its path.
+        path: PathBuf,
+        /// The cause.
+        source: image::ImageError,
+    },
+    /// The map cannot be exported.
     #[error(transparent)]
     Export(#[from] ExportError),
+    /// A file cannot be written.
+    #[error(transparent)]
+    Write(#[from] WriteError),
+    /// The adapter failed.
     #[error(transparent)]
     Gpu(#[from] GpuError),
 }
 
-/// Creates the folder, takes it for this process alone, and checks that it can be written to, before any work starts.
+/// Creates the folder, locks it for this process, and verifies that it is writable.
+///
+/// # Errors
+/// If it cannot be created or written to, or another process holds it.
 pub fn prepare_folder(out: &Path) -> Result<FolderLock, OutputError> {
     let probe = out.join(".writable");
     let folder_error = |source| OutputError::Folder { path: out.into(), source };
@@ -67,7 +108,10 @@ pub fn prepare_folder(out: &Path) -> Result<FolderLock, OutputError> {
     Ok(lock)
 }
 
-/// Removes the checkpoint of a run that is finished.
+/// Removes the checkpoint of a finished run.
+///
+/// # Errors
+/// If it exists and cannot be removed.
 pub fn remove_checkpoint(out: &Path) -> Result<(), OutputError> {
     remove_file(&out.join(CHECKPOINT))
 }
@@ -89,69 +133,101 @@ fn remove_pictures(out: &Path) -> Result<(), OutputError> {
     Ok(())
 }
 
-/// Size and hash of a written map.
+/// Size and hash of a map file.
 #[derive(Clone, Debug)]
 pub struct WrittenMap {
+    /// Size, bytes.
     pub bytes: u64,
+    /// SHA-256, hexadecimal.
     pub hash: String,
 }
 
-/// Writes what the replay made: trajectories, map, and the configuration that made them. Figures of an earlier run in the same
-/// folder go first: they would belong to another map.
-pub fn write_results(out: &Path, outcome: &Outcome, config: &Config) -> Result<WrittenMap, OutputError> {
+/// Writes trajectories, map, records and the resolved configuration. Metrics of an earlier run in the same folder are removed first: they
+/// would belong to another map.
+///
+/// # Errors
+/// If a file cannot be written, or the map holds a value that is not finite.
+pub fn write_results(out: &Path, recording: &Recording, result: &RunResult) -> Result<WrittenMap, OutputError> {
     remove_file(&out.join(METRICS))?;
-    write_atomically(&out.join(TRAJECTORY), outcome.trajectory.to_tum().as_bytes())?;
-    write_atomically(&out.join(KEYFRAMES), outcome.keyframe_trajectory().to_tum().as_bytes())?;
-    write_atomically(&out.join(CONFIG), config.to_toml().as_bytes())?;
-    write_records(&out.join(HISTORY), &outcome.history)?;
+    write_atomically(&out.join(TRAJECTORY), result.trajectory.to_tum().as_bytes())?;
+    write_atomically(&out.join(KEYFRAMES), result.keyframe_trajectory().to_tum().as_bytes())?;
+    write_atomically(&out.join(CONFIG), recording.config().to_toml().as_bytes())?;
+    write_records(&out.join(HISTORY), &result.history)?;
     remove_file(&out.join(EXPOSURES))?;
-    if config.mapping.exposure.enabled {
-        write_records(&out.join(EXPOSURES), &outcome.exposures())?;
+    if recording.config().mapping.exposure.enabled {
+        write_records(&out.join(EXPOSURES), &result.exposures())?;
     }
-    let bytes = MapFormat::Ply.write(&outcome.cloud, &out.join(MAP))?;
+    let bytes = MapFormat::Ply.write(&result.cloud, &out.join(MAP))?;
     Ok(WrittenMap { bytes: bytes.len() as u64, hash: sha256_hex(&bytes) })
 }
 
-/// What is measured against the recording, of a run of ours or anybody's.
-pub struct Measured {
+/// Errors of a trajectory and a map against their recording.
+#[derive(Clone, Debug)]
+pub struct Evaluation {
+    /// Absolute trajectory error, metres.
     pub ate_rmse_m: AteFigures,
+    /// Relative pose error per frame.
     pub rpe: RpeFigures,
-    pub images: crate::evaluation::metrics::ImageProtocols,
+    /// Image errors by each protocol.
+    pub images: ImageProtocols,
 }
 
-/// A trajectory and a map to be measured.
-pub struct Subject<'a> {
+/// A trajectory and a map to be evaluated, of any system.
+#[derive(Clone, Debug)]
+pub struct EvaluationInput<'a> {
+    /// Poses of all tracked frames.
     pub trajectory: &'a Trajectory,
-    /// Frame indices and poses of the same trajectory.
+    /// Frame indices and `world_from_camera` of the same poses.
     pub poses: Vec<(usize, Se3)>,
+    /// Poses of the keyframes.
     pub keyframes: Trajectory,
+    /// Frame indices of the keyframes.
     pub keyframe_indices: BTreeSet<usize>,
+    /// The map.
     pub cloud: &'a GaussianCloud,
+    /// Exposures of the keyframes; empty where they are not estimated.
     pub exposures: Exposures,
 }
 
-/// Measures trajectory and images, and writes the held-out views beside their renders. `progress` hears how many views are done.
-pub fn measure(
-    (sequence, config): (&Sequence, &Config),
+impl<'a> From<&'a RunResult> for EvaluationInput<'a> {
+    fn from(result: &'a RunResult) -> Self {
+        Self {
+            trajectory: &result.trajectory,
+            poses: result.frame_poses(),
+            keyframes: result.keyframe_trajectory(),
+            keyframe_indices: result.keyframe_indices(),
+            cloud: &result.cloud,
+            exposures: result.exposures(),
+        }
+    }
+}
+
+/// Measures trajectory and images, and writes held-out views beside their renders. `on_view` receives the number of views done.
+///
+/// # Errors
+/// If the adapter fails or a file cannot be written.
+pub fn evaluate(
+    recording: &Recording,
     gpu: &Arc<Gpu>,
-    subject: &Subject<'_>,
+    input: &EvaluationInput<'_>,
     out: &Path,
-    progress: &dyn Fn(usize),
-) -> Result<Measured, OutputError> {
+    on_view: &dyn Fn(usize),
+) -> Result<Evaluation, OutputError> {
+    let (sequence, config) = (recording.sequence(), recording.config());
     remove_pictures(out)?;
     let truth = sequence.groundtruth.as_ref();
     // One camera alone cannot know the scale.
     let alignment = if sequence.sensor.kind() == SensorKind::Mono { Alignment::Similarity } else { Alignment::Rigid };
     let errors = |estimate: &Trajectory| truth.and_then(|truth| evaluate_trajectory(truth, estimate, alignment).ok());
-    let (all, keyframes) = (errors(subject.trajectory), errors(&subject.keyframes));
+    let (all, keyframes) = (errors(input.trajectory), errors(&input.keyframes));
     remove_file(&out.join(DRAWING))?;
     if let (Some(truth), Some(errors)) = (truth, &all) {
-        let svg = draw_trajectory(truth, subject.trajectory, errors).map_err(OutputError::Drawing)?;
+        let svg = draw_trajectory(truth, input.trajectory, errors).map_err(OutputError::Drawing)?;
         write_atomically(&out.join(DRAWING), svg.as_bytes())?;
     }
-    let mut comparison = Comparison::of(subject.trajectory, truth.zip(all.as_ref()));
+    let mut comparison = Comparison::of(input.trajectory, truth.zip(all.as_ref()));
     let is_held_out = |index: usize| config.replay.is_held_out(index);
-    let held_out = subject.poses.iter().filter(|(index, _)| is_held_out(*index)).count();
+    let held_out = input.poses.iter().filter(|(index, _)| is_held_out(*index)).count();
     let picture_every = held_out.div_ceil(MAX_PICTURES).max(1);
     let mut seen = 0;
     let mut picture_error = None;
@@ -163,17 +239,18 @@ pub fn measure(
         comparison.views.push(view.figures);
     };
     let selection = ViewSelection {
-        poses: &subject.poses,
-        keyframes: &subject.keyframe_indices,
+        poses: &input.poses,
+        keyframes: &input.keyframe_indices,
         is_held_out: &is_held_out,
-        exposures: &subject.exposures,
+        exposures: &input.exposures,
     };
-    let images = evaluate_views((sequence, config.map_scale), (gpu, subject.cloud), &selection, &mut on_held_out, progress)?;
+    let source = ViewSource { sequence, map_scale: config.map_scale, gpu, cloud: input.cloud };
+    let images = evaluate_views(source, &selection, &mut on_held_out, on_view)?;
     if let Some(error) = picture_error {
         return Err(error);
     }
     write_records(&out.join(COMPARISON), &comparison)?;
-    Ok(Measured {
+    Ok(Evaluation {
         ate_rmse_m: AteFigures {
             all_frames: all.as_ref().map(|e| e.ate_rmse_m),
             keyframes: keyframes.as_ref().map(|e| e.ate_rmse_m),
@@ -186,12 +263,12 @@ pub fn measure(
     })
 }
 
-/// Of a held-out view in [`VIEWS`].
+/// File name of a held-out view in [`VIEWS`].
 pub fn picture_name(frame: usize) -> String {
     format!("{frame:06}.png")
 }
 
-fn write_records(path: &Path, records: &impl Serialize) -> Result<(), ExportError> {
+fn write_records(path: &Path, records: &impl Serialize) -> Result<(), WriteError> {
     let text = serde_json::to_string(records).expect("records are numbers, which JSON can hold");
     write_atomically(path, text.as_bytes())
 }
@@ -209,40 +286,45 @@ fn write_picture(out: &Path, view: &ComparedView) -> Result<(), OutputError> {
     Ok(write_atomically(&path, png.get_ref())?)
 }
 
-/// Puts all figures of a run together and writes `metrics.json`.
+/// Assembles all figures of a run and writes `metrics.json`.
+///
+/// # Errors
+/// If the file cannot be written.
 pub fn write_metrics(
-    (sequence, config): (&Sequence, &Config),
-    gpu: &Gpu,
-    outcome: &Outcome,
-    (measured, map): (Measured, WrittenMap),
     out: &Path,
+    recording: &Recording,
+    gpu: &Gpu,
+    result: &RunResult,
+    map: &WrittenMap,
+    evaluation: Evaluation,
 ) -> Result<Metrics, OutputError> {
+    let (sequence, config) = (recording.sequence(), recording.config());
     let frames = sequence.entries.len() as u64;
-    let iterations = outcome.step_ms.len() as u64;
-    let pinhole = sequence.camera.pinhole.scaled(config.map_scale);
+    let iterations = result.step_ms.len() as u64;
+    let pinhole = recording.map_pinhole();
     let metrics = Metrics {
         sequence: sequence.name.clone(),
         sensor: sequence.sensor.kind(),
         paced: config.replay.paced,
         frames,
-        frames_read_failed: outcome.frames_read_failed as u64,
-        frames_tracked: outcome.poses.len() as u64,
-        frames_late: outcome.frames_late as u64,
-        keyframes_deferred: outcome.keyframes_deferred as u64,
-        keyframes: Some(outcome.keyframes.len() as u64),
-        ate_rmse_m: measured.ate_rmse_m,
-        rpe: measured.rpe,
-        images: measured.images,
-        gaussians: Some(outcome.cloud.len() as u64),
+        frames_read_failed: result.frames_read_failed as u64,
+        frames_tracked: result.poses.len() as u64,
+        frames_late: result.frames_late as u64,
+        keyframes_deferred: result.keyframes_deferred as u64,
+        keyframes: Some(result.keyframes.len() as u64),
+        ate_rmse_m: evaluation.ate_rmse_m,
+        rpe: evaluation.rpe,
+        images: evaluation.images,
+        gaussians: Some(result.cloud.len() as u64),
         map_bytes: Some(map.bytes),
-        map_hash: Some(map.hash),
-        wall_s: Some(outcome.wall_s),
-        resumed: outcome.resumed,
-        tracking_ms: Times::of(&outcome.tracking_ms),
+        map_hash: Some(map.hash.clone()),
+        wall_s: Some(result.wall_s),
+        resumed: result.resumed,
+        tracking_ms: Times::of(&result.tracking_ms),
         mapping: Some(MappingFigures {
             iterations,
             iterations_per_frame: iterations as f64 / frames.max(1) as f64,
-            ms_per_iteration: UsualTimes::of(&outcome.step_ms),
+            ms_per_iteration: UsualTimes::of(&result.step_ms),
             map_width: pinhole.width,
             map_height: pinhole.height,
         }),

@@ -1,10 +1,9 @@
-//! `checkpoint.bin` in a run's folder, from which an interrupted run goes on to the bit.
+//! `checkpoint.bin`: the state from which an interrupted run resumes with byte-identical results.
 //!
-//! Of the tracker nothing is kept: unpaced it repeats to the bit and takes a small part of a run, so that reader and tracker begin at the
-//! first frame again, and the mapper takes what it was told up to the checkpoint for its images alone. The configuration lies in the
-//! same file: a run and its settings cannot come apart.
+//! Tracker state is not stored: deterministic replay repeats it, at a small part of a run's cost. A resumed run starts reader and tracker at the
+//! first frame; until the checkpoint is reached, the mapper only uploads keyframe images. The configuration is stored in the same file.
 //!
-//! The file is a line that says what it is, the SHA-256 of the rest, and by postcard the [`Identity`] and a [`Course`], if there is one.
+//! Layout: one text line with the version, the SHA-256 of the rest, and in postcard the [`Identity`] and an optional [`RunState`].
 
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
@@ -12,32 +11,42 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-use super::KeyframeRecord;
-use super::heard::Heard;
+use super::history::KeyframeRecord;
+use super::message_digest::MessageDigest;
 use super::outputs;
 use crate::config::Config;
-use crate::export::{ExportError, write_durably};
+use crate::files::{WriteError, write_durably};
 use crate::gpu::Gpu;
-use crate::mapping::{KeyframeReport, MapperState, RefinedPair};
-use crate::sequence::Sequence;
+use crate::mapping::{KeyframeReport, MapperState, MappingError, RefinedPair};
+use crate::recording::Recording;
 
 /// The first line; only the version that wrote a file knows how to read the rest.
 const HEAD: &str = concat!("keysplat ", env!("CARGO_PKG_VERSION"), " checkpoint\n");
 const DIGEST_BYTES: usize = 32;
 
+/// A checkpoint that cannot be read, written or resumed.
 #[derive(Debug, thiserror::Error)]
 pub enum CheckpointError {
+    /// It cannot be written.
+    #[error(transparent)]
+    Write(#[from] WriteError),
+    /// The mapper's state cannot be downloaded.
+    #[error(transparent)]
+    Mapping(#[from] MappingError),
+    /// It cannot be read.
     #[error("cannot read {path}: {source}")]
     Read { path: PathBuf, source: std::io::Error },
+    /// It is cut off or its digest differs.
     #[error("{path} is damaged or cut off, and nothing can be resumed from it; make the run anew with keysplat run")]
     Damaged { path: PathBuf },
+    /// It belongs to another run.
     #[error("{path} is of another run: {what} was {then} and is {now}; {advice}")]
     Differs { path: PathBuf, what: String, then: String, now: String, advice: &'static str },
 }
 
-/// What a run must share with its checkpoint to go on to the bit.
+/// Properties that a resumed run must share with its checkpoint.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(super) struct Identity {
+pub(crate) struct Identity {
     /// The whole configuration, TOML.
     config: String,
     adapter: String,
@@ -46,72 +55,84 @@ pub(super) struct Identity {
     recording: String,
 }
 
-/// What a run has come to.
+/// State of a run between two keyframes, or two rounds of the final refinement.
 #[derive(Debug, Serialize, Deserialize)]
-pub(super) struct Course {
-    pub heard: Heard,
+pub(crate) struct RunState {
+    /// Digest of the mapper's input so far.
+    pub digest: MessageDigest,
+    /// State of the mapper.
     pub mapper: MapperState,
     records: Vec<(KeyframeReport, [f64; 2], usize, Option<u64>)>,
-    /// What the tracker was told after each keyframe.
-    pub told: Vec<Vec<RefinedPair>>,
-    pub parts: Parts,
+    /// Pose feedback that was sent to the tracker after each keyframe.
+    pub feedback: Vec<Vec<RefinedPair>>,
+    /// Time and interruptions so far.
+    pub elapsed: Elapsed,
 }
 
-/// What a run was made in, up to a checkpoint.
+/// Wall-clock time and interruptions of a run, up to a checkpoint.
 #[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
-pub(super) struct Parts {
-    /// Time of all of them.
+pub(crate) struct Elapsed {
+    /// Wall-clock time of all processes, seconds.
     pub wall_s: f64,
-    /// How often it went on from a checkpoint.
+    /// Number of resumptions.
     pub resumed: u64,
 }
 
-/// A checkpoint that was read; which run it is of has not been looked at.
+/// A checkpoint as read, not yet compared with the run that resumes it.
 #[derive(Debug)]
 pub struct Checkpoint {
-    pub(super) path: PathBuf,
-    pub(super) identity: Identity,
+    pub(crate) path: PathBuf,
+    pub(crate) identity: Identity,
     /// `None` at the run's beginning.
-    pub(super) course: Option<Course>,
+    pub(crate) state: Option<RunState>,
 }
 
 impl Checkpoint {
-    /// Reads a file whole and checks it.
+    /// Reads a checkpoint and verifies its digest.
+    ///
+    /// # Errors
+    /// If it cannot be read, is damaged, or another version wrote it.
     pub fn read(path: &Path) -> Result<Self, CheckpointError> {
         let bytes = std::fs::read(path).map_err(|source| CheckpointError::Read { path: path.into(), source })?;
         let damaged = || CheckpointError::Damaged { path: path.into() };
         check_version(path, &bytes)?;
         let rest = bytes.strip_prefix(HEAD.as_bytes()).and_then(|rest| rest.split_at_checked(DIGEST_BYTES));
         let (_, rest) = rest.filter(|(digest, rest)| Sha256::digest(rest).as_slice() == *digest).ok_or_else(damaged)?;
-        let (identity, course) = postcard::from_bytes(rest).map_err(|_| damaged())?;
-        Ok(Self { path: path.into(), identity, course })
+        let (identity, state) = postcard::from_bytes(rest).map_err(|_| damaged())?;
+        Ok(Self { path: path.into(), identity, state })
     }
 
     /// The configuration of its run.
+    ///
+    /// # Errors
+    /// If the file is damaged.
     pub fn config(&self) -> Result<Config, CheckpointError> {
         self.identity.config().ok_or_else(|| CheckpointError::Damaged { path: self.path.clone() })
     }
 
-    /// Writes one; returns its bytes.
-    pub(super) fn write(path: &Path, identity: &Identity, course: Option<&Course>) -> Result<usize, ExportError> {
-        let rest = postcard::to_stdvec(&(identity, course)).expect("a checkpoint is plain data");
+    /// Writes a checkpoint durably; returns its size in bytes.
+    pub(crate) fn write(path: &Path, identity: &Identity, state: Option<&RunState>) -> Result<usize, WriteError> {
+        let rest = postcard::to_stdvec(&(identity, state)).expect("a checkpoint is plain data");
         let bytes = [HEAD.as_bytes(), Sha256::digest(&rest).as_slice(), &rest].concat();
         write_durably(path, &bytes)?;
         Ok(bytes.len())
     }
 }
 
-impl Course {
+impl RunState {
+    /// Packs keyframe records beside the rest.
     pub fn new(
-        heard: Heard,
+        digest: MessageDigest,
         mapper: MapperState,
-        (records, told): (&[KeyframeRecord], &[Vec<RefinedPair>]),
-        parts: Parts,
+        records: &[KeyframeRecord],
+        feedback: &[Vec<RefinedPair>],
+        elapsed: Elapsed,
     ) -> Self {
         let records = records.iter().map(|r| (r.report, [r.done_s, r.busy_s], r.waiting, r.host_bytes)).collect();
-        Self { heard, mapper, records, told: told.to_vec(), parts }
+        Self { digest, mapper, records, feedback: feedback.to_vec(), elapsed }
     }
 
+    /// Records of the keyframes so far.
     pub fn records(&self) -> Vec<KeyframeRecord> {
         let records = self.records.iter().copied();
         records
@@ -121,14 +142,16 @@ impl Course {
 }
 
 impl Identity {
-    pub fn of(sequence: &Sequence, config: &Config, gpu: &Gpu) -> Self {
+    /// Identity of a recording on an adapter.
+    pub fn of(recording: &Recording, gpu: &Gpu) -> Self {
+        let (sequence, config) = (recording.sequence(), recording.config());
         let times: Vec<f64> = sequence.entries.iter().map(|entry| entry.timestamp_s).collect();
-        let recording = format!("{:?} {:?} {times:?}", sequence.camera, sequence.sensor);
+        let frames = format!("{:?} {:?} {times:?}", sequence.camera, sequence.sensor);
         Self {
             config: config.to_toml(),
             adapter: outputs::adapter(gpu).to_string(),
             frames: times.len(),
-            recording: crate::evaluation::sha256_hex(recording.as_bytes()),
+            recording: crate::evaluation::sha256_hex(frames.as_bytes()),
         }
     }
 
@@ -136,17 +159,27 @@ impl Identity {
         toml::from_str(&self.config).ok()
     }
 
-    /// Says what differs in the run that is to go on from here.
+    /// Compares with the identity of the resuming run.
+    ///
+    /// # Errors
+    /// The first property that differs, with both values.
     pub fn check(&self, path: &Path, now: &Self) -> Result<(), CheckpointError> {
         let settings = |identity: &Self| toml::from_str(&identity.config()?.identity()).ok();
         let tables = settings(self).zip(settings(now)).ok_or_else(|| CheckpointError::Damaged { path: path.into() })?;
         if let Some((setting, then, now)) = difference(&tables.0, &tables.1) {
-            return check(path, (&setting, "give it the value that it had, or make the run anew"), (&then, &now));
+            return check(
+                path,
+                Property { name: &setting, advice: "give it the value that it had, or make the run anew" },
+                &then,
+                &now,
+            );
         }
-        check(path, ("the adapter", "resume where that one is, or make the run anew"), (&self.adapter, &now.adapter))?;
+        let adapter = Property { name: "the adapter", advice: "resume where that one is, or make the run anew" };
+        check(path, adapter, &self.adapter, &now.adapter)?;
         let advice = "put the recording back as it was, or make the run anew";
-        check(path, ("the number of frames", advice), (&self.frames, &now.frames))?;
-        check(path, ("the recording's camera or times (SHA-256)", advice), (&self.recording, &now.recording))
+        check(path, Property { name: "the number of frames", advice }, &self.frames, &now.frames)?;
+        let frames = Property { name: "the recording's camera or times (SHA-256)", advice };
+        check(path, frames, &self.recording, &now.recording)
     }
 }
 
@@ -156,19 +189,22 @@ fn check_version(path: &Path, bytes: &[u8]) -> Result<(), CheckpointError> {
     let then = line.and_then(|line| line.strip_prefix("keysplat ")?.strip_suffix(" checkpoint"));
     let advice = "resume with that version, or make the run anew";
     let now = env!("CARGO_PKG_VERSION");
-    check(path, ("the version of keysplat", advice), (&then.unwrap_or(now), &now))
+    check(path, Property { name: "the version of keysplat", advice }, &then.unwrap_or(now), &now)
 }
 
-fn check<T: Display + PartialEq>(
-    path: &Path,
-    (what, advice): (&str, &'static str),
-    (then, now): (&T, &T),
-) -> Result<(), CheckpointError> {
+/// A property to compare, and what to do where it differs.
+struct Property<'a> {
+    name: &'a str,
+    advice: &'static str,
+}
+
+fn check<T: Display + PartialEq>(path: &Path, property: Property<'_>, then: &T, now: &T) -> Result<(), CheckpointError> {
     if then == now {
         return Ok(());
     }
     let [then, now] = [then, now].map(ToString::to_string);
-    Err(CheckpointError::Differs { path: path.into(), what: what.into(), then, now, advice })
+    let Property { name, advice } = property;
+    Err(CheckpointError::Differs { path: path.into(), what: name.into(), then, now, advice })
 }
 
 /// The first setting that differs, and its two values.

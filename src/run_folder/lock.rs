@@ -24,7 +24,7 @@ impl FolderLock {
     ///
     /// # Errors
     /// If another process has it, or nothing can be written there.
-    pub(super) fn take(folder: &Path) -> Result<Self, OutputError> {
+    pub(crate) fn take(folder: &Path) -> Result<Self, OutputError> {
         let path = folder.join(NAME);
         let open = File::options().write(true).create(true).truncate(false).open(&path);
         let file = open.map_err(|source| OutputError::Folder { path: folder.into(), source })?;

@@ -11,11 +11,11 @@ use super::scenes::{Fault, Scene, between, narrow};
 use super::{Family, Machine, Outcome, Part};
 use crate::geometry::Se3;
 use crate::gpu::GpuError;
-use crate::reference::project_backward::backward;
-use crate::reference::rasterize_forward::{self, Conditioning, pixel_conditioning};
-use crate::reference::{Cutoffs, Gaussian64, Image64, ImageGradient64, View64, cloud64};
 use crate::render::Rendered;
 use crate::splat::GaussianCloud;
+use crate::verification::reference::project_backward::backward;
+use crate::verification::reference::rasterize_forward::{self, Conditioning, pixel_conditioning};
+use crate::verification::reference::{Cutoffs, Gaussian64, Image64, ImageGradient64, View64, cloud64};
 
 const BACKGROUND: [f32; 3] = [0.1, 0.2, 0.3];
 /// Relative distance from a cut-off within which f32 and f64 may disagree.

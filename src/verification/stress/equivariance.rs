@@ -16,8 +16,8 @@ use super::{Family, Machine, Outcome, Part};
 use crate::geometry::Se3;
 use crate::gpu::GpuError;
 use crate::optimise::{AdamConfig, LossConfig, TargetImage, TrainingView};
-use crate::reference::{Gaussian64, cloud64};
 use crate::splat::{Gaussian, GaussianCloud, ShDegree};
+use crate::verification::reference::{Gaussian64, cloud64};
 
 const STEPS: usize = 60;
 /// How many times the control's difference, and beyond that how much of what the parameters travelled, a moved run may differ. Controls are

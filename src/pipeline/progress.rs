@@ -1,4 +1,4 @@
-//! What the threads tell each other, and how they fail.
+//! Progress of a run, and errors of its threads.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::PathBuf;
@@ -7,80 +7,84 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use crossbeam::queue::ArrayQueue;
 
-use super::CheckpointError;
-use crate::export::ExportError;
-use crate::geometry::Se3;
-use crate::mapping::{Keyframe, KeyframeId, MappingError};
-use crate::sequence::KnownPoint;
+use crate::mapping::MappingError;
+use crate::run_folder::CheckpointError;
 use crate::splat::MapSnapshot;
 use crate::tracking::TrackingError;
 
+/// A run that ended early.
 #[derive(Debug, thiserror::Error)]
 pub enum PipelineError {
+    /// The tracker failed.
     #[error(transparent)]
     Tracking(#[from] TrackingError),
+    /// The mapper failed.
     #[error(transparent)]
     Mapping(#[from] MappingError),
+    /// A bug of ours.
     #[error("the {thread} thread panicked: {message}; what was done until then is kept. Please report this")]
-    Panicked { thread: &'static str, message: String },
+    Panicked {
+        /// Its name.
+        thread: &'static str,
+        /// The panic's message.
+        message: String,
+    },
+    /// The system starts no more threads.
     #[error("the {thread} thread could not be started: {source}")]
-    Spawn { thread: &'static str, source: std::io::Error },
-    #[error(
-        "the first frame, {color}, has no depth image near its time; the map is started from depth: give the recording's depth (depth.txt), or begin at a frame that has one with --frames"
-    )]
-    NoFirstDepth { color: PathBuf },
-    #[error(
-        "{name} has no pose within {seconds} s of any frame; known poses come from COLMAP's model, transforms.json or the recording's ground truth: leave --known-poses out to track instead"
-    )]
-    NoKnownPoses { name: String, seconds: f64 },
-    #[error(
-        "{name} has neither depth nor points to begin a map from; give COLMAP's model with its points (sparse/0/points3D.bin), or leave --known-poses out"
-    )]
-    NoKnownPoints { name: String },
-    #[error(
-        "images would be mapped at {width}x{height}, but the least is {least}x{least}; raise the mapping resolution (--map-scale)"
-    )]
-    TooSmall { width: u32, height: u32, least: u32 },
+    Spawn {
+        /// Its name.
+        thread: &'static str,
+        /// The system's error.
+        source: std::io::Error,
+    },
+    /// No frame is readable.
     #[error(
         "not one of the {frames} frames could be read; the first one failed so: {first}; check that the recording was copied whole"
     )]
-    NothingRead { frames: usize, first: String },
+    NothingRead {
+        /// Frames of the selection.
+        frames: usize,
+        /// Error of the first one.
+        first: String,
+    },
+    /// A resumed run was stopped before it reached its checkpoint.
     #[error("the run ended before it had caught up with {checkpoint}, which is kept; resume it again")]
-    NotCaughtUp { checkpoint: PathBuf },
+    NotCaughtUp {
+        /// Its file.
+        checkpoint: PathBuf,
+    },
+    /// A resumed run's tracking differs from the interrupted run's.
     #[error(
         "{checkpoint} cannot be resumed: this recording and its tracking are not what they were then; put the recording back as it was, or make the run anew"
     )]
-    NotRepeated { checkpoint: PathBuf },
+    NotRepeated {
+        /// Its file.
+        checkpoint: PathBuf,
+    },
+    /// A checkpoint that cannot be resumed.
     #[error(transparent)]
     Checkpoint(#[from] CheckpointError),
-    #[error(transparent)]
-    Export(#[from] ExportError),
 }
 
-/// Tracker → mapper. The end of the sequence is the channel's end.
-#[derive(Clone, Debug)]
-pub enum MapperMessage {
-    /// Points of the scene that came with the recording, before the first keyframe.
-    Points(Vec<KnownPoint>),
-    Keyframe(Box<Keyframe>),
-    /// Earlier keyframes that bundle adjustment moved.
-    PoseUpdate(Vec<(KeyframeId, Se3)>),
-}
-
-/// Where a run stands, for whoever shows it.
+/// Progress of the tracking thread.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct TrackingProgress {
+    /// Frames read so far.
     pub frames_done: usize,
+    /// Keyframes so far.
     pub keyframes: usize,
+    /// Whether the last frame has no pose.
     pub lost: bool,
 }
 
-/// The windows onto a run that a display may look through; each slot holds the newest value.
+/// Progress of a run, shared with a display: each slot holds the newest value.
 #[derive(Clone, Debug)]
 pub struct Progress {
+    /// Newest progress of the tracker.
     pub tracking: Arc<ArrayQueue<TrackingProgress>>,
+    /// Newest snapshot of the map.
     pub mapping: Arc<ArrayQueue<MapSnapshot>>,
-    /// Set to end the run early: what there is will be finished and returned.
+    /// Set to end the run early; its partial result is returned.
     pub stop: Arc<AtomicBool>,
 }
 
@@ -91,13 +95,13 @@ impl Default for Progress {
 }
 
 impl Progress {
-    /// Whether the run was asked to end early.
+    /// Whether the run is to end early.
     pub fn stopped(&self) -> bool {
         self.stop.load(Ordering::Relaxed)
     }
 }
 
-/// Runs one piece of a thread's work; a panic in it becomes an error, and the thread's results survive.
+/// Converts a panic in one piece of a thread's work to an error, so that the thread's results survive.
 pub(super) fn guarded<T>(thread: &'static str, work: impl FnOnce() -> Result<T, PipelineError>) -> Result<T, PipelineError> {
     catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(|payload| {
         let text = payload.downcast_ref::<&str>().map(ToString::to_string);

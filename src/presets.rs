@@ -1,0 +1,92 @@
+//! Presets of the configuration, and the mapping resolution at which an adapter keeps up with a camera.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use serde::{Deserialize, Serialize};
+
+use crate::bench::{BenchScene, StepRunner};
+use crate::config::Config;
+use crate::gpu::{Gpu, GpuError};
+use crate::recording::Recording;
+use crate::render::BlendForm;
+
+/// A named set of configuration values.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "lowercase")]
+pub enum Preset {
+    /// Keep up with the recording's own frame rate: resolution and steps follow from the adapter's speed.
+    Realtime,
+    /// The defaults.
+    Balanced,
+    /// More steps, denser insertion, and all tiles in every step.
+    Quality,
+}
+
+impl Preset {
+    /// All presets, the fastest one first.
+    pub const ALL: [Self; 3] = [Self::Realtime, Self::Balanced, Self::Quality];
+
+    /// Sets the values in which the preset differs from the defaults.
+    pub fn apply(self, config: &mut Config) {
+        let mapping = &mut config.mapping;
+        match self {
+            Self::Realtime => {
+                config.replay.paced = true;
+                mapping.yields_to_keyframes = true;
+                mapping.first_iterations = 10;
+                mapping.iterations_per_keyframe = 200;
+                mapping.window.recent = 4;
+                mapping.window.covisible = 2;
+                // Few steps fit between two keyframes, and density control costs about six of them: it runs after every fifth keyframe, and
+                // before the steps, so that no keyframe waits for it.
+                mapping.density.every = 5;
+                mapping.density.after_share = 0.0;
+                // In so few steps a tile that is left out once is hardly sampled again.
+                mapping.skip.tile_least = 1.0;
+            }
+            Self::Balanced => {}
+            // All tiles gain more than additional steps of the same duration.
+            Self::Quality => {
+                mapping.iterations_per_keyframe = 40;
+                mapping.skip.tile_least = 1.0;
+                mapping.seeding.detail = 0.04;
+                mapping.density.vcd.min_worth = 0.5;
+            }
+        }
+    }
+}
+
+/// Shares of the recorded resolution that real time may choose.
+const SCALES: [f64; 6] = [1.0, 0.75, 0.5, 0.375, 0.25, 0.125];
+/// Longest training step on an otherwise idle machine. Beside the tracker and with a grown map it takes three times as long, and about five
+/// of those still fit between two keyframes of a walking camera.
+const LONGEST_STEP: Duration = Duration::from_millis(15);
+/// Pixels for each Gaussian in view, as insertion leaves them.
+const PIXELS_PER_GAUSSIAN: u32 = 8;
+/// Least side of the mapped image, pixels.
+const LEAST_PIXELS: u32 = 96;
+
+/// Measures the largest share of the recorded resolution at which a training step is fast enough for real time.
+///
+/// # Errors
+/// If the adapter fails.
+pub fn realtime_scale(gpu: &Arc<Gpu>, recording: &Recording) -> Result<f64, GpuError> {
+    let mut chosen = 1.0;
+    for scale in SCALES {
+        let pinhole = recording.sequence().camera.pinhole.scaled(scale);
+        if scale < 1.0 && pinhole.width.min(pinhole.height) < LEAST_PIXELS {
+            break;
+        }
+        chosen = scale;
+        let size = (pinhole.width, pinhole.height);
+        let gaussians = (size.0 * size.1 / PIXELS_PER_GAUSSIAN) as usize;
+        let scene = BenchScene::new(gpu, gaussians, size, recording.config().mapping.sh_degree)?;
+        let wall = StepRunner::new(gpu, scene, BlendForm::of(gpu), None)?.run()?.wall;
+        tracing::info!(scale, step_ms = wall.as_secs_f64() * 1e3, "training step measured");
+        if wall <= LONGEST_STEP {
+            break;
+        }
+    }
+    Ok(chosen)
+}

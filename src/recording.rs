@@ -1,0 +1,157 @@
+//! A recording that has been opened with its resolved configuration: the input of every run, evaluation and benchmark.
+
+use std::path::PathBuf;
+
+use crate::config::{Config, ConfigError};
+use crate::evaluation::image::WINDOW as SSIM_WINDOW;
+use crate::evaluation::trajectory::MAX_TIME_DIFFERENCE_S;
+use crate::geometry::{Pinhole, Se3};
+use crate::sequence::{Sensor, Sequence, SequenceError};
+
+/// A selection of a sequence's frames and the configuration that maps them. Immutable: a change makes a new value.
+#[derive(Clone, Debug)]
+pub struct Recording {
+    sequence: Sequence,
+    config: Config,
+}
+
+/// A recording that cannot be opened, or cannot begin a map.
+#[derive(Debug, thiserror::Error)]
+pub enum RecordingError {
+    /// `sequence` is absent from the configuration.
+    #[error("the configuration names no recording; give its folder or video")]
+    Unnamed,
+    /// A configuration value is out of its range.
+    #[error(transparent)]
+    Config(#[from] ConfigError),
+    /// The dataset cannot be read.
+    #[error(transparent)]
+    Sequence(#[from] SequenceError),
+    /// An RGB-D recording whose first frame has no depth image.
+    #[error(
+        "the first frame, {color}, has no depth image near its time; the map is started from depth: give the recording's depth (depth.txt), or begin at a frame that has one with --frames"
+    )]
+    NoFirstDepth {
+        /// Colour image of the frame.
+        color: PathBuf,
+    },
+    /// `replay.known_poses` without a pose near any frame.
+    #[error(
+        "{name} has no pose within {seconds} s of any frame; known poses come from COLMAP's model, transforms.json or the recording's ground truth: leave --known-poses out to track instead"
+    )]
+    NoKnownPoses {
+        /// Name of the recording.
+        name: String,
+        /// Largest difference of timestamps, seconds.
+        seconds: f64,
+    },
+    /// `replay.known_poses` without depth and without points.
+    #[error(
+        "{name} has neither depth nor points to begin a map from; give COLMAP's model with its points (sparse/0/points3D.bin), or leave --known-poses out"
+    )]
+    NoKnownPoints {
+        /// Name of the recording.
+        name: String,
+    },
+    /// Images below the SSIM window's size.
+    #[error(
+        "images would be mapped at {width}x{height}, but the least is {least}x{least}; raise the mapping resolution (--map-scale)"
+    )]
+    TooSmall {
+        /// Mapping resolution, pixels.
+        width: u32,
+        /// Mapping resolution, pixels.
+        height: u32,
+        /// Least side, pixels.
+        least: u32,
+    },
+}
+
+impl Recording {
+    /// Opens the recording that `config` names, with its sensor and its selection of frames. A range of frames that goes on beyond the
+    /// recording ends with it.
+    ///
+    /// # Errors
+    /// If the configuration names no recording, the dataset cannot be read, images are too small to be compared, or `replay.known_poses` is
+    /// set and poses, or anything to begin a map from, are missing.
+    pub fn open(mut config: Config) -> Result<Self, RecordingError> {
+        config.validate()?;
+        let named = config.sequence.as_ref().ok_or(RecordingError::Unnamed)?;
+        if named.path.is_file() {
+            tracing::info!("decoding {} for the times of its frames", named.path.display());
+        }
+        let mut sequence = Sequence::open(&named.path, named.layout, named.camera.as_deref())?;
+        if let Some(kind) = named.sensor {
+            sequence.restrict_to(kind)?;
+        }
+        let recorded = sequence.entries.len();
+        let range = config.replay.frames.map(|(start, end)| start..end);
+        sequence.select(range, config.replay.every)?;
+        config.replay.frames = config.replay.frames.map(|(start, end)| (start, end.min(recorded)));
+        let recording = Self { sequence, config };
+        recording.check_size()?;
+        if recording.config.replay.known_poses {
+            recording.check_known_poses()?;
+        }
+        Ok(recording)
+    }
+
+    /// The same frames mapped at `map_scale`, a share of the recorded resolution.
+    ///
+    /// # Errors
+    /// If the scale is not above 0 and at most 1, or images become too small to be compared.
+    pub fn at_scale(mut self, map_scale: f64) -> Result<Self, RecordingError> {
+        self.config.map_scale = map_scale;
+        self.config.validate()?;
+        self.check_size()?;
+        Ok(self)
+    }
+
+    /// The frames and their camera.
+    pub fn sequence(&self) -> &Sequence {
+        &self.sequence
+    }
+
+    /// The resolved configuration.
+    pub fn config(&self) -> &Config {
+        &self.config
+    }
+
+    /// Intrinsics at the mapping resolution, without distortion.
+    pub fn map_pinhole(&self) -> Pinhole {
+        self.sequence.camera.pinhole.scaled(self.config.map_scale)
+    }
+
+    /// The recording's own `world_from_camera` at a time in seconds, if one is near.
+    pub fn known_pose(&self, timestamp_s: f64) -> Option<Se3> {
+        let truth = self.sequence.groundtruth.as_ref()?;
+        truth.nearest(timestamp_s, MAX_TIME_DIFFERENCE_S).map(|i| truth.poses[i].world_from_camera)
+    }
+
+    /// Checks that tracking can begin a map at the first frame.
+    ///
+    /// # Errors
+    /// If the sensor is RGB-D and the first frame has no depth.
+    pub fn check_first_depth(&self) -> Result<(), RecordingError> {
+        match self.sequence.entries.first() {
+            Some(first) if self.sequence.sensor == Sensor::Rgbd && first.depth.is_none() => {
+                Err(RecordingError::NoFirstDepth { color: first.color.clone() })
+            }
+            _ => Ok(()),
+        }
+    }
+
+    fn check_size(&self) -> Result<(), RecordingError> {
+        let (Pinhole { width, height, .. }, least) = (self.map_pinhole(), SSIM_WINDOW as u32);
+        if width.min(height) < least { Err(RecordingError::TooSmall { width, height, least }) } else { Ok(()) }
+    }
+
+    fn check_known_poses(&self) -> Result<(), RecordingError> {
+        let name = || self.sequence.name.clone();
+        if !self.sequence.entries.iter().any(|entry| self.known_pose(entry.timestamp_s).is_some()) {
+            return Err(RecordingError::NoKnownPoses { name: name(), seconds: MAX_TIME_DIFFERENCE_S });
+        }
+        let begins = self.sequence.sensor == Sensor::Rgbd || !self.sequence.points.is_empty();
+        if begins { Ok(()) } else { Err(RecordingError::NoKnownPoints { name: name() }) }
+    }
+}

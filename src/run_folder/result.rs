@@ -1,0 +1,70 @@
+//! The result of a run, as its folder stores it.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+
+use super::history::{History, KeyframeRecord};
+use crate::evaluation::{ExposureRecord, Exposures};
+use crate::geometry::{Se3, StampedPose, Trajectory};
+use crate::splat::GaussianCloud;
+use crate::tracking::KeyframePose;
+
+/// Trajectory, map and records of a run, whether or not it reached its end.
+#[derive(Clone, Debug, Default)]
+pub struct RunResult {
+    /// The map after the last finished keyframe or round of the final refinement.
+    pub cloud: Arc<GaussianCloud>,
+    /// Frame index and `world_from_camera` of every tracked frame.
+    pub poses: Vec<(usize, StampedPose)>,
+    /// The same poses without frame indices.
+    pub trajectory: Trajectory,
+    /// All keyframes, in order of creation.
+    pub keyframes: Vec<KeyframePose>,
+    /// Records of frames and keyframes.
+    pub history: History,
+    /// Frames that could not be read.
+    pub frames_read_failed: usize,
+    /// Real time: frames dropped because the tracker was busy.
+    pub frames_late: usize,
+    /// Real time: keyframes that the mapper never received.
+    pub keyframes_deferred: usize,
+    /// Tracking time of each frame, milliseconds.
+    pub tracking_ms: Vec<f64>,
+    /// Duration of each optimisation step, milliseconds.
+    pub step_ms: Vec<f64>,
+    /// Wall-clock time, seconds; of all processes of a resumed run, up to their checkpoints.
+    pub wall_s: f64,
+    /// Number of resumptions from a checkpoint.
+    pub resumed: u64,
+}
+
+impl RunResult {
+    /// Poses of the keyframes.
+    pub fn keyframe_trajectory(&self) -> Trajectory {
+        Trajectory { poses: self.keyframes.iter().map(KeyframePose::stamped).collect() }
+    }
+
+    /// Frame indices of the keyframes.
+    pub fn keyframe_indices(&self) -> BTreeSet<usize> {
+        self.keyframes.iter().map(|k| k.frame_index).collect()
+    }
+
+    /// Frame index and `world_from_camera` of every tracked frame.
+    pub fn frame_poses(&self) -> Vec<(usize, Se3)> {
+        self.poses.iter().map(|(index, pose)| (*index, pose.world_from_camera)).collect()
+    }
+
+    /// Estimated exposures of the mapped keyframes.
+    pub fn exposures(&self) -> Exposures {
+        exposures(&self.keyframes, &self.history.keyframes)
+    }
+}
+
+/// Exposures of mapped keyframes at the timestamps of tracked ones.
+pub(crate) fn exposures(tracked: &[KeyframePose], mapped: &[KeyframeRecord]) -> Exposures {
+    let times: BTreeMap<usize, f64> = tracked.iter().map(|k| (k.id, k.timestamp_s)).collect();
+    let record = |KeyframeRecord { report, .. }: &KeyframeRecord| {
+        Some(ExposureRecord { timestamp_s: *times.get(&report.id)?, log_gain: report.exposure })
+    };
+    Exposures::new(mapped.iter().filter_map(record).collect())
+}
