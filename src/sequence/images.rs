@@ -177,11 +177,11 @@ mod tests {
         assert!(sequence.load(0).unwrap().right.is_none() && sequence.load(1).unwrap().right.is_some());
     }
 
-    /// The README shows a file that is read as it stands.
+    /// The documentation shows a file that is read as it stands.
     #[test]
-    fn the_example_in_the_readme_is_valid() {
-        let readme = include_str!("../../README.md");
-        let example = readme.split("```toml\n").nth(1).unwrap().split("```").next().unwrap();
+    fn the_example_in_the_documentation_is_valid() {
+        let page = include_str!("../../docs/recordings.md");
+        let example = page.split("```toml\n").nth(1).unwrap().split("```").next().unwrap();
         let folder = recording(example, &[]);
         assert!(open(&folder).unwrap_err().contains("lists no frames"));
         std::fs::write(folder.path().join(FILE), example.replace("# stereo", "stereo")).unwrap();
