@@ -34,3 +34,8 @@ pub use presets::Preset;
 pub use recording::Recording;
 pub use session::{Session, SessionError};
 pub use synthetic::SceneConfig;
+
+/// The README's example, compiled with the tests.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+pub struct Readme;
