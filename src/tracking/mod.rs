@@ -7,56 +7,21 @@
 //! caller's thread changes the map, and unpaced it does so in one fixed order: the same frames give the same bits. Knows nothing of the
 //! mapper or the GPU.
 
-mod bundle;
+mod adjustment;
 mod config;
-mod culling;
-mod dense;
-mod descriptor;
-mod epipolar;
 mod error;
 mod features;
-mod frame_features;
-mod initialise;
-mod keyframe;
-mod localise;
-mod loop_alignment;
+pub(crate) mod initialisation;
+mod localisation;
 mod loop_closing;
-#[cfg(test)]
-mod loop_closing_tests;
-mod loop_correction;
-mod map;
-mod mapping;
-mod matching;
-mod measurement;
-mod mono;
-mod places;
-mod pose;
-mod pose_graph;
-mod reduced;
-mod relative_pose;
-mod relocalise;
-mod spread;
-mod stereo;
+pub(crate) mod map;
+pub(crate) mod solvers;
 mod tracker;
-mod triangulate;
-mod window;
-mod worker;
 
 pub use config::TrackingConfig;
 pub use error::TrackingError;
-pub use relative_pose::PoseMeasurement;
+pub use solvers::relative_pose::PoseMeasurement;
 pub use tracker::Tracker;
-
-/// The solvers behind the tracker, for whoever tries them alone.
-pub(crate) mod solvers {
-    pub use super::bundle::{BundleObservation, BundleProblem};
-    pub use super::initialise::two_views;
-    pub use super::loop_alignment::{Pair, align_pairs};
-    pub use super::measurement::{Measurement, Trust};
-    pub use super::pose::{PoseObservation, optimise_pose};
-    pub use super::pose_graph::{Edge, PoseGraph};
-    pub use super::triangulate::{View, triangulate};
-}
 
 use nalgebra::Vector2;
 use serde::{Deserialize, Serialize};

@@ -7,13 +7,13 @@
 
 use std::time::Instant;
 
-use super::super::culling::cull_around;
-use super::super::window::Adjustment;
-use super::super::worker::Worker;
-use super::super::{PoseMeasurement, StageTimes, TrackingError, relative_pose};
 use super::{Tracker, milliseconds};
 use crate::geometry::Se3;
 use crate::sequence::Sensor;
+use crate::tracking::adjustment::local_bundle::Adjustment;
+use crate::tracking::adjustment::thread::Worker;
+use crate::tracking::map::keyframe_culling::cull_around;
+use crate::tracking::{PoseMeasurement, StageTimes, TrackingError};
 
 /// Unpaced: frames after its keyframe at which an adjustment is taken in, at most, and as a share of those since the keyframe before:
 /// where keyframes follow each other closely the map must not lag behind. Points that were only triangulated are poor until they are
@@ -73,7 +73,7 @@ impl Tracker {
     /// [`TrackingError::Measurement`] if one has a number that is not finite or out of range, or an unknown keyframe; then none is taken.
     pub fn measure(&mut self, measurements: &[PoseMeasurement]) -> Result<(), TrackingError> {
         measurements.iter().try_for_each(|m| m.check(self.map.keyframes.len()))?;
-        measurements.iter().for_each(|m| relative_pose::keep(&mut self.map, *m));
+        measurements.iter().for_each(|m| self.map.add_pose_prior(*m));
         Ok(())
     }
 
@@ -121,7 +121,7 @@ impl Tracker {
         self.moved.extend(solved.apply(&mut self.map, &self.config));
         times.bundle_ms += milliseconds(clock);
         if let Some(keyframe) = under_way.around {
-            self.look_round(keyframe, times)?;
+            self.close_loops_and_cull(keyframe, times)?;
         }
         self.follow_keyframe();
         self.begin_next(times)
@@ -139,7 +139,7 @@ impl Tracker {
         times.bundle_ms += milliseconds(clock);
         match window {
             Some(window) => self.begin(window, Some(keyframe)),
-            None => self.look_round(keyframe, times),
+            None => self.close_loops_and_cull(keyframe, times),
         }
     }
 
@@ -153,7 +153,7 @@ impl Tracker {
 
     /// What follows when a keyframe's surroundings are as good as they get: a loop may be seen, after which all is adjusted, or some of
     /// them may have become redundant.
-    fn look_round(&mut self, keyframe: usize, times: &mut StageTimes) -> Result<(), TrackingError> {
+    fn close_loops_and_cull(&mut self, keyframe: usize, times: &mut StageTimes) -> Result<(), TrackingError> {
         let clock = Instant::now();
         let closed = self.close_loop(keyframe);
         times.loops_ms += milliseconds(clock);
@@ -175,7 +175,7 @@ impl Tracker {
             return false;
         }
         let moved = self.loops.close(&mut self.map, keyframe, &self.camera.pinhole, &self.config);
-        for (keyframe, growth) in &moved {
+        for crate::tracking::loop_closing::MovedKeyframe { keyframe, growth } in &moved {
             let theirs = self.records.iter_mut().filter(|r| r.reference == *keyframe);
             theirs.for_each(|r| r.camera_from_reference.translation.vector *= *growth);
             if *keyframe == self.reference
@@ -184,7 +184,7 @@ impl Tracker {
                 velocity.translation.vector *= *growth;
             }
         }
-        self.moved.extend(moved.iter().map(|(k, _)| *k));
+        self.moved.extend(moved.iter().map(|m| m.keyframe));
         self.follow_keyframe();
         !moved.is_empty()
     }

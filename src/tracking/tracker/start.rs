@@ -2,13 +2,15 @@
 
 use std::sync::Arc;
 
-use super::super::frame_features::FrameFeatures;
-use super::super::map::Keyframe;
-use super::super::mono::{self, FirstView};
-use super::super::{StageTimes, TrackedFrame, TrackingState, mapping};
-use super::{LastFrame, Record, Tracker};
+use super::{Record, Tracker};
 use crate::geometry::Se3;
 use crate::sequence::Frame;
+use crate::tracking::features::frame_features::FrameFeatures;
+use crate::tracking::initialisation::mono::{self, FirstView};
+use crate::tracking::localisation::localise::LastFrame;
+use crate::tracking::map::insertion;
+use crate::tracking::map::sparse_map::Keyframe;
+use crate::tracking::{StageTimes, TrackedFrame, TrackingState};
 
 impl Tracker {
     /// Starts the map with a frame that shows enough.
@@ -24,7 +26,7 @@ impl Tracker {
             features: features.clone(),
             landmarks: Vec::new(),
         };
-        let id = mapping::insert_keyframe(&mut self.map, keyframe, &self.camera.pinhole, &self.config);
+        let id = insertion::insert_keyframe(&mut self.map, keyframe, &self.camera.pinhole, &self.config);
         let landmarks = self.map.keyframes[id].landmarks.clone();
         self.last = Some(LastFrame { features, camera_from_world: Se3::identity(), landmarks });
         self.record(frame, id, Se3::identity());

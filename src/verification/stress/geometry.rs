@@ -5,7 +5,7 @@ use nalgebra::{DMatrix, DVector, Point3, UnitQuaternion, Vector2, Vector3, Vecto
 
 use super::scenes::gauss;
 use crate::geometry::{Pinhole, Se3, Sim3, se3};
-use crate::tracking::solvers::{Measurement, Trust};
+use crate::tracking::solvers::residual::{InlierClass, Measurement};
 
 pub const PINHOLE: Pinhole = Pinhole { fx: 520.0, fy: 515.0, cx: 320.5, cy: 241.0, width: 640, height: 480 };
 /// Noise of a pixel's coordinates, and of an inverse depth in a world of size 1.
@@ -96,8 +96,8 @@ pub fn noise(rng: &mut Rng) -> Vector2<f64> {
     Vector2::new(gauss(rng), gauss(rng)) * PIXEL_SIGMA
 }
 
-pub fn trust(measurement: &Measurement) -> Trust {
-    if measurement.inverse_depth.is_some() { Trust::Full } else { Trust::PixelOnly }
+pub fn trust(measurement: &Measurement) -> InlierClass {
+    if measurement.inverse_depth.is_some() { InlierClass::Full } else { InlierClass::PixelOnly }
 }
 
 /// A pose near the identity: up to `metres` and `rad` along and about each axis.

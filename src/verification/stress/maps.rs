@@ -11,7 +11,9 @@ use super::scenes::gauss;
 use super::{Family, Outcome, Part};
 use crate::geometry::sim3::Vector7;
 use crate::geometry::{Se3, Sim3, align, se3, sim3};
-use crate::tracking::solvers::{BundleObservation, BundleProblem, Edge, Pair, PoseGraph, align_pairs};
+use crate::tracking::solvers::bundle::{BundleObservation, BundleProblem};
+use crate::tracking::solvers::pose_graph::{Edge, PoseGraph};
+use crate::tracking::solvers::sim3_alignment::{Pair, align_pairs};
 
 /// Costs above the truth's by more than this share were not minimised; adjustment stops at steps that gain a ten-thousandth.
 const COST_LIMIT: f64 = 1.02;
@@ -68,7 +70,7 @@ fn bundle(rng: &mut Rng, world: &World, with_depth: bool, metres: f64, behind: u
             let p_in_camera = (truth.poses[pose] * truth.points[point]).coords;
             let Some(mut measurement) = world.measure(rng, &p_in_camera, with_depth) else { continue };
             measurement.pixel.x += if rng.f64() < 0.05 { 30.0 } else { 0.0 };
-            truth.observations.push(BundleObservation { pose, point, measurement, trust: trust(&measurement) });
+            truth.observations.push(BundleObservation { pose, point, measurement, class: trust(&measurement) });
         }
     }
     let mut problem = truth.clone();
@@ -89,12 +91,12 @@ fn solve_bundle(problem: &mut BundleProblem, truth: &mut BundleProblem, world: &
     let mut outcome = Outcome::default();
     for _ in 0..2 {
         problem.solve(&PINHOLE, STEPS);
-        problem.judge(&PINHOLE);
+        problem.classify(&PINHOLE);
     }
     let (_, cost) = problem.solve(&PINHOLE, STEPS);
     truth.observations.clone_from(&problem.observations);
     let least = truth.cost(&PINHOLE);
-    let trusted = problem.observations.iter().filter(|o| o.measurement.trusted(o.trust).is_some()).count();
+    let trusted = problem.observations.iter().filter(|o| o.measurement.restricted_to(o.class).is_some()).count();
     if trusted == 0 {
         outcome.count("refused", 1);
         return outcome;
@@ -154,12 +156,12 @@ fn pose_graph(rng: &mut Rng, graph: &Graph) -> Outcome {
         .collect();
     let sigmas = Vector7::from_fn(|i, _| graph.sigma * [graph.size, 1.0, f64::from(u8::from(graph.scale_is_free))][i / 3]);
     let weights = Vector7::from_fn(|i, _| if sigmas[i] > 0.0 { 1.0 / sigmas[i] } else { 0.0 });
-    let mut edge = |a: usize, b: usize, wrong: bool, doubt: Option<f64>| {
+    let mut edge = |a: usize, b: usize, wrong: bool, huber: Option<f64>| {
         let mut tau = Vector7::from_fn(|i, _| sigmas[i] * gauss(rng));
         if wrong {
             tau += Vector7::from_fn(|i, _| sigmas[i] * 300.0);
         }
-        Edge { a, b, a_from_b: sim3::exp(&tau) * truth[a] * truth[b].inverse(), weights, doubt }
+        Edge { a, b, a_from_b: sim3::exp(&tau) * truth[a] * truth[b].inverse(), weights, huber }
     };
     let mut problem = PoseGraph { poses: vec![truth[0]], scale_is_free: graph.scale_is_free, ..Default::default() };
     for k in 1..graph.stations {

@@ -12,7 +12,9 @@ use super::geometry::{
 };
 use super::{Family, Outcome, Part};
 use crate::geometry::{Se3, se3};
-use crate::tracking::solvers::{PoseObservation, View, optimise_pose, triangulate, two_views};
+use crate::tracking::initialisation::two_view::two_views;
+use crate::tracking::map::triangulation::{View, triangulate};
+use crate::tracking::solvers::pose::{PoseObservation, optimise_pose};
 
 /// Errors beyond this many standard deviations are not the noise's.
 const SIGMAS: f64 = 6.0;

@@ -1,0 +1,213 @@
+//! Bundle adjustment of a part of the map: makes a [`BundleProblem`] of keyframes and their landmarks and takes the result into the map
+//! (the windowed scheme of Mur-Artal & Tardós, *ORB-SLAM2*, 2017).
+//!
+//! A keyframe and those that share most landmarks with it may move, with all their landmarks; other keyframes that see these
+//! landmarks hold them in place. The first keyframe is the world and never moves. An [`Adjustment`] is a plain value that can be solved
+//! elsewhere while the map goes on: taking it in touches only what is still there.
+
+use crate::geometry::{Pinhole, Se3};
+use crate::tracking::TrackingConfig;
+use crate::tracking::map::sparse_map::{LandmarkState, Map, Observation};
+use crate::tracking::solvers::bundle::{BundleObservation, BundleProblem, RelativePose};
+use crate::tracking::solvers::residual::InlierClass;
+
+/// Keyframes that share fewer landmarks than this are not moved together.
+const MIN_SHARED: usize = 15;
+/// Keyframes that hold the window in place, at most; bounds the time.
+const MAX_FIXED: usize = 40;
+/// Keyframes that one adjustment may move: a bound on its time, which is then some seconds, and on its memory.
+const MAX_ADJUSTED: usize = 1000;
+
+/// A part of the map to be adjusted: the problem, and what its numbers mean.
+#[derive(Clone, Debug, Default)]
+pub struct Adjustment {
+    pub problem: BundleProblem,
+    /// The keyframe of each pose.
+    keyframes: Vec<usize>,
+    /// The landmark of each point.
+    landmarks: Vec<usize>,
+    /// The observation of each observation.
+    observations: Vec<Observation>,
+    /// Keyframes in the map when it was made.
+    known: usize,
+}
+
+impl Adjustment {
+    /// Of the window around `keyframe`; `None` if nothing in it may move.
+    pub fn of_window(map: &Map, keyframe: usize, config: &TrackingConfig) -> Option<Self> {
+        let (free, fixed) = choose_window(map, keyframe, config);
+        Self::new(map, &free, &fixed, config)
+    }
+
+    /// Of all keyframes; `None` if they are too many.
+    pub fn of_all(map: &Map, config: &TrackingConfig) -> Option<Self> {
+        let all: Vec<usize> = (1..map.keyframes.len()).filter(|k| !map.culled.contains_key(k)).collect();
+        if all.len() > MAX_ADJUSTED { None } else { Self::new(map, &all, &[0], config) }
+    }
+
+    /// Of the keyframes `free` and all their landmarks, held in place by `fixed`.
+    fn new(map: &Map, free: &[usize], fixed: &[usize], config: &TrackingConfig) -> Option<Self> {
+        if free.is_empty() || config.bundle_iterations == 0 {
+            return None;
+        }
+        let mut landmarks = map.landmarks_of(free);
+        landmarks.retain(|l| map.landmarks[*l].observations.len() > 1);
+        let keyframes: Vec<usize> = free.iter().chain(fixed).copied().collect();
+        let (problem, observations) = make_problem(map, &keyframes, free.len(), &landmarks, config);
+        Some(Self { problem, keyframes, landmarks, observations, known: map.keyframes.len() })
+    }
+
+    /// Moves poses and points to where they agree best, twice: outliers are found by the first round and left out of the second.
+    pub fn solve(&mut self, pinhole: &Pinhole, steps: usize) {
+        for _ in 0..2 {
+            self.problem.solve(pinhole, steps);
+            self.problem.classify(pinhole);
+        }
+    }
+
+    /// Takes the result into the map; returns the keyframes that may have moved, in ascending order. Keyframes that came since go
+    /// rigidly with the one that they share most with.
+    pub fn apply(&self, map: &mut Map, config: &TrackingConfig) -> Vec<usize> {
+        let before: Vec<Se3> = map.keyframes.iter().map(|k| k.camera_from_world).collect();
+        let mut moves = vec![false; before.len()];
+        for (k, pose) in self.keyframes.iter().zip(&self.problem.poses).take(self.problem.free_poses) {
+            map.keyframes[*k].camera_from_world = *pose;
+            moves[*k] = true;
+        }
+        for newer in self.known..before.len() {
+            let Some((neighbour, _)) = map.covisible(newer).into_iter().find(|(k, _)| moves[*k]) else { continue };
+            let newer_from_neighbour = before[newer] * before[neighbour].inverse();
+            map.keyframes[newer].camera_from_world = newer_from_neighbour * map.keyframes[neighbour].camera_from_world;
+            moves[newer] = true;
+        }
+        map.carry_culled();
+        let moved: Vec<usize> = (0..moves.len()).filter(|k| moves[map.living(*k)]).collect();
+        self.move_landmarks(map, &before, &moved);
+        for (o, observation) in self.problem.observations.iter().zip(&self.observations) {
+            let landmark = self.landmarks[o.point];
+            let still_seen = map.keyframes[observation.keyframe].landmarks[observation.feature] == Some(landmark);
+            if o.class == InlierClass::Outlier && still_seen {
+                map.remove_observation(landmark, *observation);
+            }
+        }
+        for l in &self.landmarks {
+            map.refresh_geometry(*l, config);
+        }
+        moved
+    }
+
+    /// Landmarks of the problem to their new places; those that only the moved keyframes know go with the one that saw them first.
+    fn move_landmarks(&self, map: &mut Map, before: &[Se3], moved: &[usize]) {
+        let mut adjusted = vec![false; map.landmarks.len()];
+        for (l, point) in self.landmarks.iter().zip(&self.problem.points) {
+            adjusted[*l] = true;
+            if map.landmarks[*l].state == LandmarkState::Alive {
+                map.landmarks[*l].position = *point;
+            }
+        }
+        for l in map.landmarks_of(moved).into_iter().filter(|l| !adjusted[*l]) {
+            let Some(owner) = map.landmarks[l].observations.first().map(|s| s.keyframe) else { continue };
+            if moved.binary_search(&owner).is_ok() {
+                let p_in_camera = before[owner] * map.landmarks[l].position;
+                map.landmarks[l].position = map.keyframes[owner].camera_from_world.inverse_transform_point(&p_in_camera);
+            }
+        }
+    }
+}
+
+/// Adjusts the window around `keyframe` at once.
+pub fn adjust_window(map: &mut Map, keyframe: usize, pinhole: &Pinhole, config: &TrackingConfig) {
+    if let Some(mut window) = Adjustment::of_window(map, keyframe, config) {
+        window.solve(pinhole, config.bundle_iterations);
+        window.apply(map, config);
+    }
+}
+
+/// Keyframes that move (`keyframe` among them) and keyframes that hold them.
+fn choose_window(map: &Map, keyframe: usize, config: &TrackingConfig) -> (Vec<usize>, Vec<usize>) {
+    let neighbours = map.covisible(keyframe).into_iter().filter(|(_, shared)| *shared >= MIN_SHARED).map(|(k, _)| k);
+    let mut free: Vec<usize> = std::iter::once(keyframe).chain(neighbours).take(config.window_keyframes).collect();
+    free.retain(|k| *k != 0);
+    let landmarks = map.landmarks_of(&free);
+    let covisibility = map.covisibility(landmarks.into_iter());
+    let mut fixed: Vec<usize> = covisibility.into_iter().map(|(k, _)| k).filter(|k| !free.contains(k)).take(MAX_FIXED).collect();
+    if fixed.is_empty()
+        && let Some(oldest) = free.iter().copied().min()
+    {
+        free.retain(|k| *k != oldest);
+        fixed.push(oldest);
+    }
+    (free, fixed)
+}
+
+fn make_problem(
+    map: &Map,
+    keyframes: &[usize],
+    free_poses: usize,
+    landmarks: &[usize],
+    config: &TrackingConfig,
+) -> (BundleProblem, Vec<Observation>) {
+    let mut place = vec![None; map.keyframes.len()];
+    keyframes.iter().enumerate().for_each(|(i, k)| place[*k] = Some(i));
+    let mut problem = BundleProblem {
+        poses: keyframes.iter().map(|k| map.keyframes[*k].camera_from_world).collect(),
+        free_poses,
+        points: landmarks.iter().map(|l| map.landmarks[*l].position).collect(),
+        ..Default::default()
+    };
+    for m in map.measured.values() {
+        if let (Some(a), Some(b)) = (place[m.keyframe], place[m.relative_to])
+            && a.min(b) < free_poses
+        {
+            problem.relative.push(RelativePose { edge: m.edge(a, b), believed: true });
+        }
+    }
+    let mut observations = Vec::new();
+    for (point, l) in landmarks.iter().enumerate() {
+        for observation in &map.landmarks[*l].observations {
+            let Some(pose) = place[observation.keyframe] else { continue };
+            let measurement = map.keyframes[observation.keyframe].features.features[observation.feature].measurement(config);
+            let class = if measurement.inverse_depth.is_some() { InlierClass::Full } else { InlierClass::PixelOnly };
+            problem.observations.push(BundleObservation { pose, point, measurement, class });
+            observations.push(*observation);
+        }
+    }
+    (problem, observations)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::{Sim3, se3};
+    use crate::tracking::loop_closing::tests::drifted;
+    use crate::tracking::map::sparse_map::Keyframe;
+    use nalgebra::{Point3, Vector6};
+
+    #[test]
+    fn a_result_is_taken_into_a_map_that_has_gone_on() {
+        let config = TrackingConfig::default();
+        let mut map = drifted(&Sim3::identity(), true, &config);
+        let last = map.keyframes.len() - 1;
+        let mut window = Adjustment::of_window(&map, last, &config).unwrap();
+        let gone = window.landmarks[3];
+        map.remove_landmark(gone);
+        window.problem.observations.iter_mut().filter(|o| o.point == 3).for_each(|o| o.class = InlierClass::Outlier);
+        // A newer keyframe sees what the last one saw, and one landmark of its own.
+        let newer = map.keyframes.len();
+        let seen = map.keyframes[last].landmarks.clone();
+        map.keyframes.push(Keyframe { landmarks: vec![None; seen.len()], ..map.keyframes[last].clone() });
+        for (feature, landmark) in seen.into_iter().enumerate().skip(1) {
+            landmark.into_iter().for_each(|l| map.add_observation(l, Observation { keyframe: newer, feature }));
+        }
+        let own = map.add_landmark(Observation { keyframe: newer, feature: 0 }, Point3::new(1.0, 2.0, 3.0), &config);
+        let pose = map.keyframes[newer].camera_from_world;
+        // As if all that is free had been moved alike.
+        let push = se3::exp(&Vector6::new(0.02, -0.01, 0.03, 0.01, 0.02, -0.02));
+        window.problem.poses.iter_mut().for_each(|p| *p *= push);
+        let moved = window.apply(&mut map, &config);
+        assert!(moved.contains(&last) && moved.contains(&newer) && !moved.contains(&0) && moved.is_sorted());
+        assert!(se3::log(&(map.keyframes[newer].camera_from_world * (pose * push).inverse())).norm() < 1e-12);
+        assert!((map.landmarks[own].position - push.inverse() * Point3::new(1.0, 2.0, 3.0)).norm() < 1e-12);
+        assert!(map.landmarks[gone].state == LandmarkState::Removed && map.landmarks[gone].observations.is_empty());
+    }
+}

@@ -1,0 +1,8 @@
+//! ORB keypoints and descriptors of a frame, their depths, and matching.
+
+pub mod descriptor;
+pub mod frame_features;
+pub mod matching;
+pub mod orb;
+pub mod quadtree;
+pub mod stereo;

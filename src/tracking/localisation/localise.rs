@@ -1,0 +1,276 @@
+//! The pose of one frame against the map: from the last frame's points where motion can be predicted, from a known view where not,
+//! then from the local map (Mur-Artal & Tardós, *ORB-SLAM2*, 2017).
+
+use std::sync::Arc;
+
+use nalgebra::Point3;
+
+use crate::geometry::{Pinhole, Se3};
+use crate::tracking::TrackingConfig;
+use crate::tracking::features::frame_features::FrameFeatures;
+use crate::tracking::features::matching::{Query, Rules, match_by_projection};
+use crate::tracking::localisation::pnp::{pose_from_view, similar_keyframes};
+use crate::tracking::map::sparse_map::Map;
+use crate::tracking::solvers::pose::{PoseObservation, optimise_pose};
+use crate::tracking::solvers::residual::InlierClass;
+
+/// Search radius around last frame's points, pixels at the finest level, widened in turn until enough are found.
+const MOTION_RADII: [f64; 3] = [8.0, 16.0, 32.0];
+const MOTION_RULES: Rules = Rules { max_distance: 80, ratio: 0.9, check_rotation: true };
+/// Matches with which a search is wide enough, and inliers with which its pose is believed enough to look at the map.
+const MOTION_MATCHES: usize = 40;
+const MOTION_INLIERS: usize = 15;
+/// Inliers that make it worth to look more closely around a rough pose.
+const ROUGH_INLIERS: usize = 8;
+/// Search radius around landmarks, pixels at the finest level: seen from about the known direction, and otherwise.
+const MAP_RADIUS_STRAIGHT: f64 = 5.0;
+const MAP_RADIUS_OBLIQUE: f64 = 8.0;
+/// Cosine of the angle up to which a view is straight.
+const STRAIGHT_COSINE: f64 = 0.998;
+/// The radius grows by this where the pose is rough.
+const ROUGH_FACTOR: f64 = 2.5;
+const MAP_RULES: Rules = Rules { max_distance: 80, ratio: 0.8, check_rotation: false };
+/// The local map: keyframes that see the frame's landmarks, and what these share most with.
+const LOCAL_KEYFRAMES: usize = 20;
+const LOCAL_SEEDS: usize = 5;
+const LOCAL_NEIGHBOURS: usize = 5;
+/// Keyframes tried when lost.
+const RELOCALISATION_KEYFRAMES: usize = 4;
+
+/// The last frame that has a pose.
+#[derive(Clone, Debug)]
+pub struct LastFrame {
+    pub features: Arc<FrameFeatures>,
+    pub camera_from_world: Se3,
+    /// The living landmark that each feature shows.
+    pub landmarks: Vec<Option<usize>>,
+}
+
+/// A frame with its pose found.
+#[derive(Clone, Debug)]
+pub struct Localised {
+    pub camera_from_world: Se3,
+    /// The landmark that each feature shows.
+    pub landmarks: Vec<Option<usize>>,
+    pub inliers: usize,
+    /// How many were matched, inliers and outliers.
+    pub matches: usize,
+    /// Whether the pose came without a prediction.
+    pub rough: bool,
+    /// Whether it is held by all pixels instead of by landmarks.
+    pub dense: bool,
+}
+
+/// Features whose points in the world are known (`None` where not), and the landmarks among these.
+pub struct View {
+    features: Arc<FrameFeatures>,
+    points: Vec<Option<Point3<f64>>>,
+    landmarks: Vec<Option<usize>>,
+}
+
+/// What the searches need.
+pub struct Context<'a> {
+    pub map: &'a mut Map,
+    pub pinhole: &'a Pinhole,
+    pub config: &'a TrackingConfig,
+}
+
+impl Context<'_> {
+    /// From a view and a predicted pose: searches ever wider around the view's points until enough is found, and again closely
+    /// around where a wide search has led.
+    pub fn with_motion_model(&self, frame: &FrameFeatures, view: &View, predicted: &Se3) -> Option<Localised> {
+        let mut best: Option<Localised> = None;
+        for radius in MOTION_RADII {
+            let (mut found, matches) = self.search(frame, view, predicted, radius);
+            if radius > MOTION_RADII[0] && found.inliers >= ROUGH_INLIERS {
+                let (again, _) = self.search(frame, view, &found.camera_from_world, MOTION_RADII[0]);
+                found = if again.inliers > found.inliers { again } else { found };
+            }
+            let enough = matches >= MOTION_MATCHES && 2 * found.inliers >= matches;
+            if best.as_ref().is_none_or(|b| found.inliers > b.inliers) {
+                best = Some(found);
+            }
+            if enough {
+                break;
+            }
+        }
+        best.filter(|b| b.inliers >= MOTION_INLIERS)
+    }
+
+    /// From a view without a prediction.
+    pub fn against_view(&self, frame: &FrameFeatures, view: &View) -> Option<Localised> {
+        let rough = pose_from_view(&view.features.features, &view.points, frame, self.pinhole)?;
+        let pairs: Vec<(usize, usize)> = rough.matches.iter().map(|m| (m.query, m.feature)).collect();
+        let mut found = self.settle(frame, &rough.camera_from_world, &pairs, |i| view.points[i], |i| view.landmarks[i]);
+        if found.inliers >= ROUGH_INLIERS {
+            let (guided, _) = self.search(frame, view, &found.camera_from_world, MOTION_RADII[1]);
+            found = if guided.inliers > found.inliers { guided } else { found };
+        }
+        found.rough = true;
+        (found.inliers >= MOTION_INLIERS).then_some(found)
+    }
+
+    /// The last frame as a view: its landmarks, and temporary points from depth for its other features.
+    pub fn view_of_last(&self, last: &LastFrame) -> View {
+        let world_from_camera = last.camera_from_world.inverse();
+        let temporary = |i| last.features.point_in_camera(i, self.pinhole).map(|p| world_from_camera * p);
+        let point = |i: usize| last.landmarks[i].map(|l| self.map.landmarks[l].position).or_else(|| temporary(i));
+        View {
+            features: last.features.clone(),
+            points: (0..last.features.len()).map(point).collect(),
+            landmarks: last.landmarks.clone(),
+        }
+    }
+
+    /// A keyframe's landmarks as a view.
+    pub fn view_of_keyframe(&self, keyframe: usize) -> View {
+        let keyframe = &self.map.keyframes[keyframe];
+        View {
+            features: keyframe.features.clone(),
+            points: keyframe.landmarks.iter().map(|l| l.map(|l| self.map.landmarks[l].position)).collect(),
+            landmarks: keyframe.landmarks.clone(),
+        }
+    }
+
+    /// From the map alone, when lost: `reference` and the keyframes that look most alike; the best of them.
+    pub fn relocalise(&mut self, frame: &FrameFeatures, reference: usize) -> Option<Localised> {
+        let mut tried = vec![reference];
+        tried.extend(similar_keyframes(self.map, frame, RELOCALISATION_KEYFRAMES).into_iter().filter(|k| *k != reference));
+        let mut best: Option<Localised> = None;
+        for keyframe in tried {
+            let Some(rough) = self.against_view(frame, &self.view_of_keyframe(keyframe)) else { continue };
+            let found = self.in_local_map(frame, &rough, keyframe);
+            if best.as_ref().is_none_or(|b| found.inliers > b.inliers) {
+                best = Some(found);
+            }
+        }
+        best
+    }
+
+    /// Refines a pose with all landmarks around it.
+    pub fn in_local_map(&mut self, frame: &FrameFeatures, start: &Localised, reference: usize) -> Localised {
+        let mut taken: Vec<bool> = start.landmarks.iter().map(Option::is_some).collect();
+        let mut pairs: Vec<(usize, usize)> =
+            start.landmarks.iter().enumerate().filter_map(|(feature, l)| l.map(|l| (l, feature))).collect();
+        let mut matched = vec![false; self.map.landmarks.len()];
+        pairs.iter().for_each(|(l, _)| matched[*l] = true);
+        let (mut asked, mut queries) = (Vec::new(), Vec::new());
+        for l in self.local_landmarks(start, reference) {
+            let Some(seen) = self.map.predict(l, &start.camera_from_world, self.pinhole, self.config) else { continue };
+            self.map.landmarks[l].observable += 1;
+            if matched[l] {
+                continue;
+            }
+            let base = if seen.view_cosine > STRAIGHT_COSINE { MAP_RADIUS_STRAIGHT } else { MAP_RADIUS_OBLIQUE };
+            let factor = if start.rough { ROUGH_FACTOR } else { 1.0 };
+            asked.push(l);
+            queries.push(Query {
+                pixel: seen.pixel,
+                radius: base * factor * self.config.pyramid_scale.powi(seen.octave.into()),
+                octaves: seen.octave.saturating_sub(1)..=seen.octave,
+                descriptor: self.map.landmarks[l].descriptor,
+                angle_rad: 0.0,
+                inverse_depth: seen.inverse_depth,
+            });
+        }
+        for m in match_by_projection(frame, &taken, &queries, &MAP_RULES) {
+            taken[m.feature] = true;
+            pairs.push((asked[m.query], m.feature));
+        }
+        let mut found = self.settle(frame, &start.camera_from_world, &pairs, |l| Some(self.map.landmarks[l].position), Some);
+        found.rough = start.rough;
+        for l in found.landmarks.iter().flatten() {
+            self.map.landmarks[*l].observed += 1;
+        }
+        found
+    }
+
+    /// At a pose that something else has found: the landmarks that agree with it.
+    pub fn at_pose(&mut self, frame: &FrameFeatures, camera_from_world: Se3, reference: usize) -> Localised {
+        let blank =
+            Localised { camera_from_world, landmarks: vec![None; frame.len()], inliers: 0, matches: 0, rough: true, dense: true };
+        let found = self.in_local_map(frame, &blank, reference);
+        let mut landmarks = found.landmarks;
+        for (feature, landmark) in landmarks.iter_mut().enumerate() {
+            let agrees = |l: &usize| {
+                let p_in_camera = (camera_from_world * self.map.landmarks[*l].position).coords;
+                frame.features[feature].measurement(self.config).classify(self.pinhole, &p_in_camera) != InlierClass::Outlier
+            };
+            *landmark = landmark.filter(agrees);
+        }
+        let inliers = landmarks.iter().flatten().count();
+        Localised { landmarks, inliers, ..blank }
+    }
+
+    /// Optimises a pose over pairs (source that `known` knows the point of, feature) and keeps the landmarks that agree.
+    fn settle(
+        &self,
+        frame: &FrameFeatures,
+        initial: &Se3,
+        pairs: &[(usize, usize)],
+        known: impl Fn(usize) -> Option<Point3<f64>>,
+        landmark_of: impl Fn(usize) -> Option<usize>,
+    ) -> Localised {
+        let mut landmarks = vec![None; frame.len()];
+        let usable: Vec<(usize, usize, PoseObservation)> = pairs
+            .iter()
+            .filter_map(|(source, feature)| {
+                let measurement = frame.features[*feature].measurement(self.config);
+                known(*source).map(|point_in_world| (*source, *feature, PoseObservation { point_in_world, measurement }))
+            })
+            .collect();
+        let observations: Vec<PoseObservation> = usable.iter().map(|u| u.2).collect();
+        let estimate = optimise_pose(self.pinhole, initial, &observations);
+        for ((source, feature, _), trust) in usable.iter().zip(&estimate.classes) {
+            if *trust != InlierClass::Outlier {
+                landmarks[*feature] = landmark_of(*source);
+            }
+        }
+        Localised {
+            camera_from_world: estimate.camera_from_world,
+            landmarks,
+            inliers: estimate.inliers,
+            matches: usable.len(),
+            rough: false,
+            dense: false,
+        }
+    }
+
+    /// Looks for a view's points around where `pose` shows them, and settles the pose; also returns the number of matches.
+    fn search(&self, frame: &FrameFeatures, view: &View, pose: &Se3, radius: f64) -> (Localised, usize) {
+        let (mut asked, mut queries) = (Vec::new(), Vec::new());
+        for (index, (feature, point)) in view.features.features.iter().zip(&view.points).enumerate() {
+            let Some(point) = point else { continue };
+            let p_in_camera = (pose * point).coords;
+            let Some(pixel) = self.pinhole.project(&p_in_camera).filter(|p| self.pinhole.contains(p, 0.0)) else { continue };
+            asked.push(index);
+            queries.push(Query {
+                pixel,
+                radius: radius * self.config.pyramid_scale.powi(feature.octave.into()),
+                octaves: feature.octave.saturating_sub(1)..=feature.octave + 1,
+                descriptor: feature.descriptor,
+                angle_rad: feature.angle_rad,
+                inverse_depth: 1.0 / p_in_camera.z,
+            });
+        }
+        let matches = match_by_projection(frame, &[], &queries, &MOTION_RULES);
+        let pairs: Vec<(usize, usize)> = matches.iter().map(|m| (asked[m.query], m.feature)).collect();
+        (self.settle(frame, pose, &pairs, |i| view.points[i], |i| view.landmarks[i]), matches.len())
+    }
+
+    fn local_landmarks(&self, start: &Localised, reference: usize) -> Vec<usize> {
+        let seeds = self.map.covisibility(start.landmarks.iter().flatten().copied());
+        let mut keyframes: Vec<usize> = seeds.iter().take(LOCAL_KEYFRAMES).map(|(k, _)| *k).collect();
+        if !keyframes.contains(&reference) {
+            keyframes.push(reference);
+        }
+        for (seed, _) in seeds.iter().take(LOCAL_SEEDS) {
+            for (neighbour, _) in self.map.covisible(*seed).into_iter().take(LOCAL_NEIGHBOURS) {
+                if !keyframes.contains(&neighbour) {
+                    keyframes.push(neighbour);
+                }
+            }
+        }
+        self.map.landmarks_of(&keyframes)
+    }
+}

@@ -1,0 +1,203 @@
+//! Loop detection: finds a place that a new keyframe shows again, verifies it, and estimates the corrected pose (after Mur-Artal, Montiel & Tardós, *ORB-SLAM*, 2015, sec. VII, and Campos et al.,
+//! *ORB-SLAM3*, 2021, sec. VI, whose idea it is to confirm a loop by the keyframe's neighbours at once instead of waiting).
+//!
+//! A false loop ruins a map and a missed one only leaves its drift, so each step may refuse: the place must resemble the keyframe about
+//! as much as its own neighbours do, the landmarks must align rigidly, most of what should be seen must be seen, neighbours must agree,
+//! and the correction must be one that drift can explain.
+
+use crate::geometry::{Pinhole, Se3, Sim3};
+use crate::tracking::TrackingConfig;
+use crate::tracking::features::matching::{Query, Rules, match_all, match_by_projection};
+use crate::tracking::map::sparse_map::Map;
+use crate::tracking::solvers::pose::{PoseObservation, optimise_pose};
+use crate::tracking::solvers::residual::InlierClass;
+use crate::tracking::solvers::sim3_alignment::{Pair, align_pairs};
+
+/// Least keyframes between a place and its return.
+const MIN_AGE: usize = 10;
+/// Keyframes that share this many landmarks need no loop closed between them.
+pub const CONNECTED_SHARED: usize = 15;
+/// A place must resemble the keyframe this much in relation to its most similar neighbour.
+const MIN_SCORE_SHARE: f64 = 0.25;
+const MAX_CANDIDATES: usize = 3;
+const MATCH_RULES: Rules = Rules { max_distance: 50, ratio: 0.85, check_rotation: true };
+/// Keyframes around the place whose landmarks are looked for.
+const PLACE_NEIGHBOURS: usize = 8;
+/// Search radius around the place's landmarks, pixels at the finest level.
+const PROJECTION_RADIUS: f64 = 6.0;
+const PROJECTION_RULES: Rules = Rules { max_distance: 60, ratio: 0.9, check_rotation: false };
+/// Landmarks of the place that the keyframe must show, in number and as a share of what it should show.
+const MIN_INLIERS: usize = 40;
+const MIN_FOUND_SHARE: f64 = 0.15;
+/// The same of the keyframe's neighbours, and how many of how many must agree.
+const MIN_NEIGHBOUR_INLIERS: usize = 25;
+const NEIGHBOURS_ASKED: usize = 4;
+const NEIGHBOURS_AGREEING: usize = 2;
+/// What drift can explain: metres for each metre of the way since, radians for each radian turned, and some of each to begin with; the
+/// scale within this factor.
+const MAX_DRIFT_SHARE: f64 = 0.15;
+const DRIFT_METRES: f64 = 0.1;
+const DRIFT_RAD: f64 = 0.1;
+const MAX_SCALE_DRIFT: f64 = 2.0;
+
+/// A place that was recognised and made sure of.
+#[derive(Clone, Debug)]
+pub struct Recognised {
+    /// The keyframe that shows it, and the old keyframe that showed it first.
+    pub keyframe: usize,
+    pub place: usize,
+    /// Where the keyframe ought to be: camera_from_world, its unit being that in which the keyframe is now.
+    pub corrected: Sim3,
+    /// The place's landmarks, and the keyframe's features that show them.
+    pub matches: Vec<(usize, usize)>,
+    /// All landmarks around the place.
+    pub landmarks: Vec<usize>,
+}
+
+/// Whether depth was measured: then lengths cannot drift.
+pub fn knows_scale(map: &Map) -> bool {
+    map.keyframes.first().is_some_and(|k| k.features.features.iter().any(|f| f.depth_metres.is_some()))
+}
+
+/// What recognition needs.
+pub struct Search<'a> {
+    pub map: &'a Map,
+    pub pinhole: &'a Pinhole,
+    pub config: &'a TrackingConfig,
+    pub scale_is_free: bool,
+}
+
+impl Search<'_> {
+    /// Old keyframes that resemble `keyframe` and are not connected with it, best first, one of each place.
+    pub fn candidates(&self, keyframe: usize) -> Vec<usize> {
+        let connected = self.connected(keyframe);
+        let is_connected = |k: usize| k == keyframe || connected.contains(&k);
+        let ranked = self.map.database.query(&self.map.keyframes[keyframe].features.features);
+        let neighbour = ranked.iter().find(|r| r.keyframe != keyframe && is_connected(r.keyframe));
+        let least = MIN_SCORE_SHARE * neighbour.map_or(0.0, |r| r.score);
+        let mut chosen: Vec<usize> = Vec::new();
+        for found in ranked.iter().filter(|r| r.score >= least && !is_connected(r.keyframe)) {
+            let old = found.keyframe + MIN_AGE <= keyframe;
+            let same_place = || chosen.iter().any(|c| self.connected(*c).contains(&found.keyframe));
+            if old && !same_place() {
+                chosen.push(found.keyframe);
+            }
+            if chosen.len() == MAX_CANDIDATES {
+                break;
+            }
+        }
+        chosen
+    }
+
+    /// Keyframes that share enough landmarks with a keyframe, strongest first.
+    fn connected(&self, keyframe: usize) -> Vec<usize> {
+        let shared = self.map.covisible(keyframe).into_iter();
+        shared.take_while(|(_, shared)| *shared >= CONNECTED_SHARED).map(|(k, _)| k).collect()
+    }
+
+    /// Makes sure that `keyframe` shows `place`.
+    pub fn recognise(&self, keyframe: usize, place: usize) -> Option<Recognised> {
+        let aligned = self.align(keyframe, place)?;
+        let mut around = vec![place];
+        around.extend(self.connected(place).into_iter().filter(|k| *k + MIN_AGE <= keyframe).take(PLACE_NEIGHBOURS));
+        let landmarks = self.map.landmarks_of(&around);
+        let rough = aligned * Sim3::from(self.map.keyframes[place].camera_from_world);
+        let seen = self.search_in(&landmarks, keyframe, &rough.to_rigid());
+        if seen.matches.len() < MIN_INLIERS || (seen.matches.len() as f64) < MIN_FOUND_SHARE * seen.expected as f64 {
+            return None;
+        }
+        let current = self.map.keyframes[keyframe].camera_from_world;
+        let agrees = |neighbour: &usize| {
+            let neighbour_from_keyframe = self.map.keyframes[*neighbour].camera_from_world * current.inverse();
+            // The neighbours' motion in the place's unit.
+            let mut motion = neighbour_from_keyframe;
+            motion.translation.vector /= rough.scale;
+            let seen = self.search_in(&landmarks, *neighbour, &(motion * seen.camera_from_world));
+            seen.matches.len() >= MIN_NEIGHBOUR_INLIERS
+        };
+        let agreeing = self.connected(keyframe).iter().take(NEIGHBOURS_ASKED).filter(|k| agrees(k)).count();
+        let corrected = Sim3 {
+            rotation: seen.camera_from_world.rotation,
+            translation: seen.camera_from_world.translation.vector * rough.scale,
+            scale: rough.scale,
+        };
+        if agreeing < NEIGHBOURS_AGREEING || !self.plausible(keyframe, place, &corrected) {
+            return None;
+        }
+        Some(Recognised { keyframe, place, corrected, matches: seen.matches, landmarks })
+    }
+
+    /// keyframe_from_place, from landmarks whose features match.
+    fn align(&self, keyframe: usize, place: usize) -> Option<Sim3> {
+        let (a, b) = (&self.map.keyframes[keyframe], &self.map.keyframes[place]);
+        let known: Vec<bool> = a.landmarks.iter().map(Option::is_some).collect();
+        let matches = match_all(&a.features.features, &known, &b.features.features, &MATCH_RULES);
+        let pair = |(i, j): (usize, usize)| {
+            let (p, q) = (&self.map.landmarks[a.landmarks[i]?], &self.map.landmarks[b.landmarks[j]?]);
+            Some(Pair {
+                p_in_a: a.camera_from_world * p.position,
+                p_in_b: b.camera_from_world * q.position,
+                in_a: a.features.features[i].measurement(self.config),
+                in_b: b.features.features[j].measurement(self.config),
+            })
+        };
+        let pairs: Vec<Pair> = matches.iter().filter_map(|m| pair((m.query, m.feature))).collect();
+        align_pairs(&pairs, self.pinhole, self.scale_is_free)
+    }
+
+    /// Looks for landmarks in a keyframe as if it were at `camera_from_world`, and improves that pose by what it finds.
+    fn search_in(&self, landmarks: &[usize], keyframe: usize, camera_from_world: &Se3) -> Seen {
+        let features = &self.map.keyframes[keyframe].features;
+        let (mut asked, mut queries) = (Vec::new(), Vec::new());
+        for l in landmarks {
+            let Some(seen) = self.map.predict(*l, camera_from_world, self.pinhole, self.config) else { continue };
+            asked.push(*l);
+            queries.push(Query {
+                pixel: seen.pixel,
+                radius: PROJECTION_RADIUS * self.config.pyramid_scale.powi(seen.octave.into()),
+                octaves: seen.octave.saturating_sub(1)..=seen.octave + 1,
+                descriptor: self.map.landmarks[*l].descriptor,
+                angle_rad: 0.0,
+                inverse_depth: seen.inverse_depth,
+            });
+        }
+        let found = match_by_projection(features, &[], &queries, &PROJECTION_RULES);
+        let observation = |landmark: usize, feature: usize| PoseObservation {
+            point_in_world: self.map.landmarks[landmark].position,
+            measurement: features.features[feature].measurement(self.config),
+        };
+        let observations: Vec<PoseObservation> = found.iter().map(|m| observation(asked[m.query], m.feature)).collect();
+        let estimate = optimise_pose(self.pinhole, camera_from_world, &observations);
+        let good = found.iter().zip(&estimate.classes).filter(|(_, trust)| **trust != InlierClass::Outlier);
+        let matches = good.map(|(m, _)| (asked[m.query], m.feature)).collect();
+        Seen { camera_from_world: estimate.camera_from_world, matches, expected: asked.len() }
+    }
+
+    /// Whether drift on the way from `place` to `keyframe` can explain the correction.
+    fn plausible(&self, keyframe: usize, place: usize, corrected: &Sim3) -> bool {
+        let current = self.map.keyframes[keyframe].camera_from_world;
+        let off = corrected.to_rigid().inverse() * current;
+        let centre = |k: usize| self.map.keyframes[k].centre();
+        let steps = (place..keyframe).map(|k| (k, k + 1));
+        let path_metres: f64 = steps.clone().map(|(a, b)| (centre(b) - centre(a)).norm()).sum();
+        let turn = |(a, b): (usize, usize)| {
+            let pose = |k: usize| self.map.keyframes[k].camera_from_world.rotation;
+            pose(a).angle_to(&pose(b))
+        };
+        let rotation_rad: f64 = steps.map(turn).sum();
+        let shift = (current.inverse().translation.vector - corrected.to_rigid().inverse().translation.vector).norm();
+        let grown = corrected.scale.max(1.0 / corrected.scale);
+        shift <= DRIFT_METRES + MAX_DRIFT_SHARE * path_metres
+            && off.rotation.angle() <= DRIFT_RAD + MAX_DRIFT_SHARE * rotation_rad
+            && grown <= MAX_SCALE_DRIFT
+    }
+}
+
+/// What a keyframe shows of some landmarks.
+struct Seen {
+    camera_from_world: Se3,
+    /// Landmark and feature.
+    matches: Vec<(usize, usize)>,
+    /// Landmarks that should be in the image.
+    expected: usize,
+}

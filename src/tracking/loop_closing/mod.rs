@@ -1,0 +1,48 @@
+//! Loop closing: detection of a revisited place, and correction of the map by a pose graph.
+
+mod correction;
+mod detection;
+#[cfg(test)]
+pub mod tests;
+
+use crate::geometry::Pinhole;
+use crate::tracking::TrackingConfig;
+use crate::tracking::map::Map;
+use crate::tracking::solvers::pose_graph::Edge;
+pub use correction::MovedKeyframe;
+use correction::correct;
+use detection::{Search, knows_scale};
+
+/// Least keyframes between two closed loops.
+const REST: usize = 5;
+
+/// Closes loops, and remembers them: later corrections keep to earlier ones.
+#[derive(Clone, Debug, Default)]
+pub struct LoopCloser {
+    /// The keyframe of the last loop.
+    last: Option<usize>,
+    /// Factors of all loops.
+    edges: Vec<Edge>,
+}
+
+impl LoopCloser {
+    /// Closes a loop if `keyframe`, one of the newest, shows a place left long ago. Returns the keyframes that may have moved, in ascending
+    /// order; none if there was no loop.
+    pub fn close(&mut self, map: &mut Map, keyframe: usize, pinhole: &Pinhole, config: &TrackingConfig) -> Vec<MovedKeyframe> {
+        if self.last.is_some_and(|last| keyframe < last + REST) {
+            return Vec::new();
+        }
+        let search = Search { map, pinhole, config, scale_is_free: !knows_scale(map) };
+        let recognised = search.candidates(keyframe).into_iter().find_map(|place| search.recognise(keyframe, place));
+        let Some(recognised) = recognised else { return Vec::new() };
+        let scale_is_free = search.scale_is_free;
+        self.last = Some(keyframe);
+        tracing::info!(keyframe, place = recognised.place, landmarks = recognised.matches.len(), "loop closed");
+        correct(map, &recognised, &mut self.edges, scale_is_free, pinhole, config)
+    }
+
+    /// Whether a loop begins or ends at a keyframe.
+    pub fn holds(&self, keyframe: usize) -> bool {
+        self.edges.iter().any(|e| e.a == keyframe || e.b == keyframe)
+    }
+}

@@ -1,0 +1,163 @@
+//! A made-up walk round a hall, drifted on purpose: the closed loop must bring it back, with known scale and without.
+
+use std::sync::Arc;
+
+use nalgebra::{Point3, Vector3};
+
+use crate::geometry::sim3::{self, Vector7};
+use crate::geometry::{Se3, Sim3, align};
+use crate::tracking::TrackingConfig;
+use crate::tracking::adjustment::local_bundle::Adjustment;
+use crate::tracking::features::descriptor::Descriptor;
+use crate::tracking::features::frame_features::{Feature, FrameFeatures};
+use crate::tracking::loop_closing::LoopCloser;
+use crate::tracking::map::sparse_map::{Keyframe, Map, Observation};
+use crate::tracking::solvers::relative_pose::PoseMeasurement;
+use crate::tracking::solvers::residual::tests::PINHOLE;
+
+const STATIONS: usize = 48;
+/// Keyframes past the first round.
+const BEYOND: usize = 6;
+
+/// camera_from_world on a circle of 2 m in a round hall of 5 m, looking outwards, a little higher in the second round.
+fn station(k: usize) -> Se3 {
+    let angle = k as f64 / STATIONS as f64 * std::f64::consts::TAU;
+    let height = if k < STATIONS { 0.0 } else { 0.1 };
+    (Se3::new(Vector3::zeros(), Vector3::y() * angle) * Se3::translation(0.0, height, 2.0)).inverse()
+}
+
+/// Points of the hall's wall, each with a descriptor of its own.
+fn wall() -> Vec<(Point3<f64>, Descriptor)> {
+    let mut random = fastrand::Rng::with_seed(8);
+    let mut point = || {
+        let (angle, y) = (std::f64::consts::TAU * random.f64(), 3.0 * random.f64() - 1.5);
+        let radius = 4.5 + random.f64();
+        let at = Point3::new(radius * angle.sin(), y, radius * angle.cos());
+        (at, Descriptor(std::array::from_fn(|_| random.u64(..))))
+    };
+    (0..2500).map(|_| point()).collect()
+}
+
+/// What a station sees: features with the wall's points that they show.
+fn view(k: usize, wall: &[(Point3<f64>, Descriptor)], with_depth: bool) -> (Vec<Feature>, Vec<usize>) {
+    let seen = wall.iter().enumerate().filter_map(|(i, (p, descriptor))| {
+        let p_in_camera = (station(k) * p).coords;
+        let pixel = PINHOLE.project(&p_in_camera).filter(|pixel| PINHOLE.contains(pixel, 0.0))?;
+        let depth_metres = with_depth.then_some(p_in_camera.z);
+        Some((Feature { pixel, octave: 2, angle_rad: 0.0, depth_metres, inverse_depth_sigma: 0.025, descriptor: *descriptor }, i))
+    });
+    seen.unzip()
+}
+
+/// The walk as a tracker with a drift of `step` from keyframe to keyframe would have mapped it: landmarks lie where the keyframe that
+/// first saw them put them, and are forgotten after a few keyframes.
+pub(crate) fn drifted(step: &Sim3, with_depth: bool, config: &TrackingConfig) -> Map {
+    let wall = wall();
+    let mut map = Map::default();
+    let mut known: Vec<Option<(usize, usize)>> = vec![None; wall.len()];
+    let mut drifted = Sim3::from(station(0));
+    for id in 0..STATIONS + BEYOND {
+        if id > 0 {
+            drifted = *step * Sim3::from(station(id) * station(id - 1).inverse()) * drifted;
+        }
+        let (features, points) = view(id, &wall, with_depth);
+        map.database.insert(id, &features);
+        map.keyframes.push(Keyframe {
+            frame_index: id,
+            timestamp_s: id as f64,
+            camera_from_world: drifted.to_rigid(),
+            landmarks: vec![None; features.len()],
+            features: Arc::new(FrameFeatures::new(features, &PINHOLE)),
+        });
+        for (feature, point) in points.into_iter().enumerate() {
+            let observation = Observation { keyframe: id, feature };
+            match known[point].filter(|(_, last)| last + 3 > id) {
+                Some((landmark, _)) => {
+                    map.add_observation(landmark, observation);
+                    known[point] = Some((landmark, id));
+                }
+                None => {
+                    let position = drifted.inverse().act(&(station(id) * wall[point].0));
+                    known[point] = Some((map.add_landmark(observation, position, config), id));
+                }
+            }
+        }
+    }
+    (0..map.landmarks.len()).for_each(|l| map.refresh_geometry(l, config));
+    map
+}
+
+/// Largest distance between a keyframe's centre and its true one, metres, after alignment (with scale where it is free).
+fn off_metres(map: &Map, scale_is_free: bool) -> f64 {
+    let centres: Vec<_> = map.keyframes.iter().map(|k| k.centre().coords).collect();
+    let truth: Vec<_> = (0..centres.len()).map(|k| station(k).inverse().translation.vector).collect();
+    let aligned = align(&centres, &truth, scale_is_free).unwrap();
+    centres.iter().zip(&truth).map(|(c, t)| (aligned.act(&(*c).into()).coords - t).norm()).fold(0.0, f64::max)
+}
+
+#[test]
+fn a_loop_is_closed_with_and_without_scale() {
+    let config = TrackingConfig { bundle_iterations: 10, ..Default::default() };
+    for (growth, with_depth) in [(0.0, true), (0.004, false)] {
+        let step = sim3::exp(&Vector7::from_column_slice(&[0.004, 0.001, -0.003, 0.001, 0.003, 0.0005, growth]));
+        let mut map = drifted(&step, with_depth, &config);
+        let (newest, before) = (map.keyframes.len() - 1, off_metres(&map, !with_depth));
+        assert!(before > 0.1 && map.covisible(newest).iter().all(|(k, _)| *k > 20), "{before} m");
+        let mut again = map.clone();
+        let moved = LoopCloser::default().close(&mut map, newest, &PINHOLE, &config);
+        let mut all = Adjustment::of_all(&map, &config).unwrap();
+        all.solve(&PINHOLE, config.bundle_iterations);
+        all.apply(&mut map, &config);
+        assert_eq!(moved.iter().map(|m| m.keyframe).collect::<Vec<_>>(), (1..=newest).collect::<Vec<_>>());
+        assert!(moved.iter().all(|m| if with_depth { m.growth == 1.0 } else { (0.7..1.3).contains(&m.growth) }));
+        let after = off_metres(&map, !with_depth);
+        assert!(after < 0.25 * before, "{before} m → {after} m with depth: {with_depth}");
+        assert!(map.covisible(newest).iter().any(|(k, shared)| *k < 10 && *shared > 50), "both ends of the loop are joined");
+
+        LoopCloser::default().close(&mut again, newest, &PINHOLE, &config);
+        all.apply(&mut again, &config);
+        assert_eq!(again.keyframes[newest].camera_from_world, map.keyframes[newest].camera_from_world);
+    }
+}
+
+#[test]
+fn measured_poses_hold_the_corrected_map_together_if_they_are_believed() {
+    let config = TrackingConfig::default();
+    let step = sim3::exp(&Vector7::from_column_slice(&[0.004, 0.001, -0.003, 0.001, 0.003, 0.0005, 0.0]));
+    let before = drifted(&step, true, &config);
+    let newest = before.keyframes.len() - 1;
+    let close = |off: Option<f64>| {
+        let mut map = before.clone();
+        let pose = |k: usize| before.keyframes[k].camera_from_world;
+        for (keyframe, off) in off.into_iter().flat_map(|off| (5..40).map(move |k| (k, off))) {
+            let relative_to = keyframe - 2;
+            let measurement = PoseMeasurement {
+                keyframe,
+                relative_to,
+                keyframe_from_relative: Se3::translation(off, 0.0, 0.0) * pose(keyframe) * pose(relative_to).inverse(),
+                sigma_translation_metres: 1e-3,
+                sigma_rotation_rad: 1e-3,
+            };
+            map.add_pose_prior(measurement);
+        }
+        assert!(!LoopCloser::default().close(&mut map, newest, &PINHOLE, &config).is_empty());
+        map.keyframes.iter().map(|k| k.camera_from_world).collect::<Vec<_>>()
+    };
+    let without = close(None);
+    assert_eq!(close(Some(0.5)), without, "half a metre off is not believed");
+    assert_ne!(close(Some(0.0)), without);
+}
+
+#[test]
+fn no_loop_is_seen_where_there_is_none() {
+    let config = TrackingConfig::default();
+    let mut map = drifted(&Sim3::identity(), true, &config);
+    let mut closer = LoopCloser::default();
+    // Half way round; and a drift that nobody would believe.
+    assert!(closer.close(&mut map, STATIONS / 2, &PINHOLE, &config).is_empty());
+    let newest = map.keyframes.len() - 1;
+    for keyframe in &mut map.keyframes[STATIONS - 4..] {
+        keyframe.camera_from_world = Se3::translation(30.0, 0.0, 0.0) * keyframe.camera_from_world;
+    }
+    assert!(closer.close(&mut map, newest, &PINHOLE, &config).is_empty());
+}

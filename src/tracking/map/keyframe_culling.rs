@@ -1,0 +1,155 @@
+//! Culling of keyframes: those of which nearly all that they see is seen as well by others are given up, so that the map grows with what
+//! is explored and not with time (the rule of Mur-Artal, Montiel & Tardós, *ORB-SLAM*, 2015, sec. VI-E).
+//!
+//! A culled keyframe keeps its id and its place in the list: its pose goes rigidly with the living keyframe that it shared most with.
+//! But it sees nothing any more, and hence takes part in nothing.
+
+use std::sync::Arc;
+
+use crate::tracking::TrackingConfig;
+use crate::tracking::features::frame_features::FrameFeatures;
+use crate::tracking::map::sparse_map::{CulledKeyframe, LandmarkState, Map, Observation};
+
+/// Share of a keyframe's landmarks that must be seen elsewhere, and by how many other keyframes.
+const REDUNDANT_SHARE: f64 = 0.9;
+const OTHERS: usize = 3;
+/// Pyramid levels by which they may see them coarser: as much as a corner is found on one level or the next by chance.
+const COARSER: u8 = 1;
+/// The newest keyframes stay: what they see is still growing.
+const KEPT_NEWEST: usize = 5;
+
+/// Culls the redundant ones among the keyframes that share landmarks with `around`. `keep` names those that must stay; the first
+/// keyframe and the newest ones stay as well. Returns the culled ones in the order in which they went.
+pub fn cull_around(map: &mut Map, around: usize, keep: impl Fn(usize) -> bool, config: &TrackingConfig) -> Vec<usize> {
+    let oldest_kept = map.keyframes.len().saturating_sub(KEPT_NEWEST);
+    let mut culled = Vec::new();
+    for (keyframe, _) in map.covisible(around) {
+        if keyframe > 0 && keyframe < oldest_kept && !keep(keyframe) && is_redundant(map, keyframe) && cull(map, keyframe, config)
+        {
+            culled.push(keyframe);
+        }
+    }
+    culled
+}
+
+/// Whether others see nearly all of what a keyframe sees, about as finely as it does.
+fn is_redundant(map: &Map, keyframe: usize) -> bool {
+    let octave = |s: &Observation| map.keyframes[s.keyframe].features.features[s.feature].octave;
+    let (mut seen, mut elsewhere) = (0, 0);
+    for (feature, landmark) in map.keyframes[keyframe].landmarks.iter().enumerate() {
+        let Some(landmark) = landmark else { continue };
+        let own = octave(&Observation { keyframe, feature });
+        let finer = |s: &&Observation| s.keyframe != keyframe && octave(s) <= own + COARSER;
+        seen += 1;
+        elsewhere += usize::from(map.landmarks[*landmark].observations.iter().filter(finer).count() >= OTHERS);
+    }
+    elsewhere as f64 >= REDUNDANT_SHARE * f64::from(seen) && seen > 0
+}
+
+/// Culls a keyframe; `false` if no other could be its parent.
+fn cull(map: &mut Map, keyframe: usize, config: &TrackingConfig) -> bool {
+    let Some((parent, _)) = map.covisible(keyframe).first().copied() else { return false };
+    let pose = |map: &Map, k: usize| map.keyframes[k].camera_from_world;
+    let camera_from_parent = pose(map, keyframe) * pose(map, parent).inverse();
+    for (feature, landmark) in std::mem::take(&mut map.keyframes[keyframe].landmarks).into_iter().enumerate() {
+        let Some(landmark) = landmark else { continue };
+        map.landmarks[landmark].observations.retain(|s| *s != Observation { keyframe, feature });
+        if map.landmarks[landmark].observations.is_empty() {
+            map.landmarks[landmark].state = LandmarkState::Removed;
+        }
+        map.refresh_geometry(landmark, config);
+    }
+    let features = std::mem::replace(&mut map.keyframes[keyframe].features, Arc::new(FrameFeatures::default()));
+    map.database.remove(keyframe, &features.features);
+    // Its own culled keyframes get its parent.
+    for held in map.culled.values_mut().filter(|held| held.parent == keyframe) {
+        *held = CulledKeyframe { parent, camera_from_parent: held.camera_from_parent * camera_from_parent };
+    }
+    map.culled.insert(keyframe, CulledKeyframe { parent, camera_from_parent });
+    map.move_pose_priors(keyframe);
+    true
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::{Se3, se3};
+    use crate::tracking::features::descriptor::Descriptor;
+    use crate::tracking::features::frame_features::tests::feature;
+    use crate::tracking::map::sparse_map::Keyframe;
+    use crate::tracking::solvers::residual::tests::PINHOLE;
+    use nalgebra::{Point3, Vector6};
+
+    const LANDMARKS: usize = 40;
+
+    /// Twelve keyframes in a row, all of which see the same landmarks, but for `own` that only keyframe 3 sees; its octave is its own.
+    fn map(own: usize, octave: u8) -> Map {
+        let mut map = Map::default();
+        for id in 0..12 {
+            let t = 0.1 * id as f64;
+            let features: Vec<_> = (0..LANDMARKS + own)
+                .map(|i| {
+                    let mut feature = feature(10.0 * i as f64, 100.0, Descriptor([i as u64, id, 0, 0]));
+                    feature.octave = if id == 3 { octave } else { 2 };
+                    feature
+                })
+                .collect();
+            map.database.insert(id as usize, &features);
+            map.keyframes.push(Keyframe {
+                frame_index: id as usize,
+                timestamp_s: t,
+                camera_from_world: se3::exp(&Vector6::new(t, 0.0, 0.0, 0.0, 0.1 * t, 0.0)),
+                landmarks: vec![None; features.len()],
+                features: Arc::new(FrameFeatures::new(features, &PINHOLE)),
+            });
+            for feature in 0..LANDMARKS {
+                let observation = Observation { keyframe: id as usize, feature };
+                if id == 0 {
+                    map.add_landmark(observation, Point3::new(0.1 * feature as f64, 0.0, 3.0), &TrackingConfig::default());
+                } else {
+                    map.add_observation(feature, observation);
+                }
+            }
+        }
+        for feature in LANDMARKS..LANDMARKS + own {
+            map.add_landmark(Observation { keyframe: 3, feature }, Point3::new(0.0, 0.0, 2.0), &TrackingConfig::default());
+        }
+        map
+    }
+
+    fn cull_all(map: &mut Map, keep: usize) -> Vec<usize> {
+        let mut culled = cull_around(map, 11, |k| k == keep, &TrackingConfig::default());
+        culled.sort_unstable();
+        culled
+    }
+
+    #[test]
+    fn what_others_see_is_given_up_and_what_only_one_sees_stays() {
+        assert_eq!(cull_all(&mut map(4, 2), 2), [1, 3, 4, 5, 6]);
+        assert_eq!(cull_all(&mut map(5, 2), 2), [1, 4, 5, 6], "5 of 45 landmarks are its own");
+        assert_eq!(cull_all(&mut map(0, 1), 2), [1, 3, 4, 5, 6]);
+        assert_eq!(cull_all(&mut map(0, 0), 2), [1, 4, 5, 6], "it sees them finer than the others");
+    }
+
+    #[test]
+    fn a_culled_keyframe_sees_nothing_and_goes_with_its_holder() {
+        let mut map = map(0, 2);
+        let places = map.database.query(&map.keyframes[5].features.features.clone());
+        assert!(places.iter().any(|p| p.keyframe == 5));
+        let poses: Vec<Se3> = map.keyframes.iter().map(|k| k.camera_from_world).collect();
+        let gone = map.keyframes[5].features.features.clone();
+        assert_eq!(cull_all(&mut map, 2), [1, 3, 4, 5, 6]);
+        assert!(map.database.query(&gone).iter().all(|p| p.keyframe != 5));
+        assert!(map.covisible(11).iter().all(|(k, _)| !map.culled.contains_key(k)));
+        assert!(map.landmarks.iter().all(|l| l.observations.iter().all(|s| !map.culled.contains_key(&s.keyframe))));
+        assert!(map.culled.values().all(|held| !map.culled.contains_key(&held.parent)), "nobody is held by one that is held");
+        let push = se3::exp(&Vector6::new(0.3, -0.1, 0.2, 0.2, 0.1, 0.4));
+        for k in 0..12 {
+            map.keyframes[k].camera_from_world *= push;
+        }
+        map.carry_culled();
+        for (k, pose) in poses.iter().enumerate() {
+            assert!(se3::log(&(map.keyframes[k].camera_from_world * (pose * push).inverse())).norm() < 1e-9, "{k}");
+        }
+    }
+}

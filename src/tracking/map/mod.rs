@@ -1,0 +1,10 @@
+//! The sparse map: keyframes, landmarks and covisibility; their creation, fusion and culling.
+
+pub mod insertion;
+pub mod keyframe_culling;
+pub mod keyframe_database;
+pub mod pose_priors;
+pub mod sparse_map;
+pub mod triangulation;
+
+pub use sparse_map::Map;

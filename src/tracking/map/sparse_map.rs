@@ -1,0 +1,357 @@
+//! The sparse map: keyframes, landmarks, who sees what, and the covisibility that follows from it.
+//!
+//! Everything is indexed by its place in a `Vec` (ids never change and are never reused), so every walk has one order. A culled keyframe
+//! keeps its place and its pose, and nothing else.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use nalgebra::{Point3, Vector2, Vector3};
+
+use crate::geometry::{Pinhole, Se3};
+use crate::tracking::TrackingConfig;
+use crate::tracking::features::descriptor::{Descriptor, representative};
+use crate::tracking::features::frame_features::FrameFeatures;
+use crate::tracking::map::keyframe_database::KeyframeDatabase;
+use crate::tracking::solvers::relative_pose::PoseMeasurement;
+
+/// A landmark is looked for only within 60° of the mean direction from which it was seen.
+const MIN_VIEW_COSINE: f64 = 0.5;
+/// Slack on the range of distances at which the pyramid can see a landmark.
+const RANGE_SLACK: f64 = 1.2;
+/// A landmark's descriptor is chosen among those of its latest observations.
+const DESCRIPTORS_COMPARED: usize = 10;
+
+/// Feature `feature` of keyframe `keyframe` shows a landmark.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Observation {
+    pub keyframe: usize,
+    pub feature: usize,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum LandmarkState {
+    Alive,
+    Removed,
+    /// It turned out to be another landmark.
+    MergedInto(usize),
+}
+
+#[derive(Clone, Debug)]
+pub struct Landmark {
+    /// In the world, metres.
+    pub position: Point3<f64>,
+    pub descriptor: Descriptor,
+    /// Mean direction from the cameras to it, unit length.
+    pub view_direction: Vector3<f64>,
+    /// Nearest and furthest distance at which the pyramid shows it as it was seen, metres.
+    pub range: (f64, f64),
+    /// At most one per keyframe, in order of arrival.
+    pub observations: Vec<Observation>,
+    /// Keyframe that made it.
+    pub first_keyframe: usize,
+    /// Frames in which it should have been seen, and was.
+    pub observable: u32,
+    pub observed: u32,
+    pub state: LandmarkState,
+}
+
+#[derive(Clone, Debug)]
+pub struct Keyframe {
+    pub frame_index: usize,
+    pub timestamp_s: f64,
+    pub camera_from_world: Se3,
+    pub features: Arc<FrameFeatures>,
+    /// The landmark that each feature shows.
+    pub landmarks: Vec<Option<usize>>,
+}
+
+/// What is left of a culled keyframe: it goes rigidly with a living one.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct CulledKeyframe {
+    /// A keyframe that has not been culled.
+    pub parent: usize,
+    pub camera_from_parent: Se3,
+}
+
+/// Where a landmark should appear.
+#[derive(Clone, Copy, Debug)]
+pub struct Prediction {
+    pub pixel: Vector2<f64>,
+    pub octave: u8,
+    /// Cosine between the line of sight and the landmark's mean one.
+    pub view_cosine: f64,
+    pub inverse_depth: f64,
+}
+
+#[derive(Clone, Debug, Default)]
+pub struct Map {
+    pub keyframes: Vec<Keyframe>,
+    pub landmarks: Vec<Landmark>,
+    /// By which keyframes are recognised.
+    pub database: KeyframeDatabase,
+    /// By keyframe; none is held by another culled one.
+    pub culled: BTreeMap<usize, CulledKeyframe>,
+    /// By pair of living keyframes, the lower id first.
+    pub measured: BTreeMap<(usize, usize), PoseMeasurement>,
+}
+
+impl Map {
+    /// A landmark first seen by `observation`.
+    pub fn add_landmark(&mut self, observation: Observation, position: Point3<f64>, config: &TrackingConfig) -> usize {
+        let id = self.landmarks.len();
+        self.landmarks.push(Landmark {
+            position,
+            descriptor: self.keyframes[observation.keyframe].features.features[observation.feature].descriptor,
+            view_direction: Vector3::z(),
+            range: (0.0, f64::INFINITY),
+            observations: vec![observation],
+            first_keyframe: observation.keyframe,
+            observable: 1,
+            observed: 1,
+            state: LandmarkState::Alive,
+        });
+        self.keyframes[observation.keyframe].landmarks[observation.feature] = Some(id);
+        self.refresh_geometry(id, config);
+        id
+    }
+
+    /// Records that a keyframe sees a landmark. Nothing changes if either is already spoken for.
+    pub fn add_observation(&mut self, landmark: usize, observation: Observation) {
+        let slot = &mut self.keyframes[observation.keyframe].landmarks[observation.feature];
+        if slot.is_none() && !self.landmarks[landmark].seen_by(observation.keyframe) {
+            *slot = Some(landmark);
+            self.landmarks[landmark].observations.push(observation);
+        }
+    }
+
+    /// Takes a observation back; a landmark that nobody sees any more is removed.
+    pub fn remove_observation(&mut self, landmark: usize, observation: Observation) {
+        self.keyframes[observation.keyframe].landmarks[observation.feature] = None;
+        let observations = &mut self.landmarks[landmark].observations;
+        observations.retain(|s| *s != observation);
+        if observations.is_empty() {
+            self.landmarks[landmark].state = LandmarkState::Removed;
+        }
+    }
+
+    pub fn remove_landmark(&mut self, landmark: usize) {
+        for observation in std::mem::take(&mut self.landmarks[landmark].observations) {
+            self.keyframes[observation.keyframe].landmarks[observation.feature] = None;
+        }
+        self.landmarks[landmark].state = LandmarkState::Removed;
+    }
+
+    /// `from` is the same point as `into`, which takes over its observations.
+    pub fn merge(&mut self, from: usize, into: usize) {
+        if from == into
+            || self.landmarks[from].state != LandmarkState::Alive
+            || self.landmarks[into].state != LandmarkState::Alive
+        {
+            return;
+        }
+        for observation in std::mem::take(&mut self.landmarks[from].observations) {
+            self.keyframes[observation.keyframe].landmarks[observation.feature] = None;
+            self.add_observation(into, observation);
+        }
+        let (observable, observed) = (self.landmarks[from].observable, self.landmarks[from].observed);
+        self.landmarks[from].state = LandmarkState::MergedInto(into);
+        self.landmarks[into].observable += observable;
+        self.landmarks[into].observed += observed;
+    }
+
+    /// The living landmark that `landmark` has become, if any.
+    pub fn resolve(&self, landmark: usize) -> Option<usize> {
+        let mut id = landmark;
+        loop {
+            match self.landmarks[id].state {
+                LandmarkState::Alive => return Some(id),
+                LandmarkState::Removed => return None,
+                LandmarkState::MergedInto(next) => id = next,
+            }
+        }
+    }
+
+    /// Chooses a landmark's descriptor among its latest observations.
+    pub fn refresh_descriptor(&mut self, landmark: usize) {
+        let latest = self.landmarks[landmark].observations.iter().rev().take(DESCRIPTORS_COMPARED);
+        let descriptors: Vec<Descriptor> =
+            latest.map(|s| self.keyframes[s.keyframe].features.features[s.feature].descriptor).collect();
+        if let Some(descriptor) = representative(&descriptors) {
+            self.landmarks[landmark].descriptor = descriptor;
+        }
+    }
+
+    /// Works out again what follows from a landmark's position and observations: its direction and range.
+    pub fn refresh_geometry(&mut self, landmark: usize, config: &TrackingConfig) {
+        let l = &self.landmarks[landmark];
+        let (Some(first), LandmarkState::Alive) = (l.observations.first(), l.state) else { return };
+        let mut direction = Vector3::zeros();
+        for observation in &l.observations {
+            let line = l.position - self.keyframes[observation.keyframe].centre();
+            direction += line.try_normalize(1e-9).unwrap_or_default();
+        }
+        let keyframe = &self.keyframes[first.keyframe];
+        let scale = |octave: usize| config.pyramid_scale.powi(octave as i32);
+        let octave = usize::from(keyframe.features.features[first.feature].octave);
+        let furthest = (l.position - keyframe.centre()).norm() * scale(octave);
+        let view_direction = direction.try_normalize(1e-9).unwrap_or(l.view_direction);
+        let l = &mut self.landmarks[landmark];
+        l.view_direction = view_direction;
+        l.range = (furthest / scale(config.pyramid_levels - 1), furthest);
+    }
+
+    /// Where a camera should see a landmark; `None` if it should not.
+    pub fn predict(
+        &self,
+        landmark: usize,
+        camera_from_world: &Se3,
+        pinhole: &Pinhole,
+        config: &TrackingConfig,
+    ) -> Option<Prediction> {
+        let l = &self.landmarks[landmark];
+        let p_in_camera = (camera_from_world * l.position).coords;
+        let pixel = pinhole.project(&p_in_camera).filter(|pixel| pinhole.contains(pixel, 0.0))?;
+        let distance = p_in_camera.norm();
+        if distance < l.range.0 / RANGE_SLACK || distance > l.range.1 * RANGE_SLACK {
+            return None;
+        }
+        let line_of_sight = camera_from_world.rotation.inverse() * p_in_camera / distance;
+        let view_cosine = line_of_sight.dot(&l.view_direction);
+        if view_cosine < MIN_VIEW_COSINE {
+            return None;
+        }
+        let octave = ((l.range.1 / distance).ln() / config.pyramid_scale.ln()).ceil();
+        let octave = octave.clamp(0.0, config.pyramid_levels as f64 - 1.0) as u8;
+        Some(Prediction { pixel, octave, view_cosine, inverse_depth: 1.0 / p_in_camera.z })
+    }
+
+    /// Keyframes that see the given landmarks and how many of them, most first, then newest first.
+    pub fn covisibility(&self, landmarks: impl Iterator<Item = usize>) -> Vec<(usize, usize)> {
+        let mut counts = vec![0usize; self.keyframes.len()];
+        for landmark in landmarks {
+            self.landmarks[landmark].observations.iter().for_each(|s| counts[s.keyframe] += 1);
+        }
+        let mut ranked: Vec<(usize, usize)> = counts.into_iter().enumerate().filter(|(_, count)| *count > 0).collect();
+        ranked.sort_by_key(|(keyframe, count)| (std::cmp::Reverse(*count), std::cmp::Reverse(*keyframe)));
+        ranked
+    }
+
+    /// Keyframes that share landmarks with a keyframe and how many, strongest first.
+    pub fn covisible(&self, keyframe: usize) -> Vec<(usize, usize)> {
+        let mut ranked = self.covisibility(self.keyframes[keyframe].landmarks.iter().flatten().copied());
+        ranked.retain(|(other, _)| *other != keyframe);
+        ranked
+    }
+
+    /// The keyframe itself if it lives, else the one that it goes with.
+    pub fn living(&self, keyframe: usize) -> usize {
+        self.culled.get(&keyframe).map_or(keyframe, |held| held.parent)
+    }
+
+    /// Puts culled keyframes where those that hold them have moved.
+    pub fn carry_culled(&mut self) {
+        for (keyframe, held) in &self.culled {
+            self.keyframes[*keyframe].camera_from_world = held.camera_from_parent * self.keyframes[held.parent].camera_from_world;
+        }
+    }
+
+    /// Median depth of the landmarks that a keyframe sees, metres.
+    pub fn median_depth(&self, keyframe: usize) -> Option<f64> {
+        let view = &self.keyframes[keyframe];
+        let depth = |l: &usize| (view.camera_from_world * self.landmarks[*l].position).z;
+        let mut depths: Vec<f64> = view.landmarks.iter().flatten().map(depth).collect();
+        depths.sort_by(f64::total_cmp);
+        depths.get(depths.len() / 2).copied()
+    }
+
+    /// The landmarks of some keyframes, each once, in order of first mention.
+    pub fn landmarks_of(&self, keyframes: &[usize]) -> Vec<usize> {
+        let mut seen = vec![false; self.landmarks.len()];
+        let all = keyframes.iter().flat_map(|k| self.keyframes[*k].landmarks.iter().flatten().copied());
+        all.filter(|l| !std::mem::replace(&mut seen[*l], true)).collect()
+    }
+}
+
+impl Landmark {
+    pub fn seen_by(&self, keyframe: usize) -> bool {
+        self.observations.iter().any(|s| s.keyframe == keyframe)
+    }
+}
+
+impl Keyframe {
+    /// The camera's centre in the world, metres.
+    pub fn centre(&self) -> Point3<f64> {
+        self.camera_from_world.inverse_transform_point(&Point3::origin())
+    }
+
+    /// How many landmarks it sees that at least `observations` keyframes see.
+    pub fn landmark_count(&self, map: &Map, observations: usize) -> usize {
+        self.landmarks.iter().flatten().filter(|l| map.landmarks[**l].observations.len() >= observations).count()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::tracking::features::frame_features::tests::feature;
+    use crate::tracking::solvers::residual::tests::PINHOLE;
+
+    fn config() -> TrackingConfig {
+        TrackingConfig::default()
+    }
+
+    /// Three keyframes of ten features each, at one place.
+    fn map() -> Map {
+        let list = (0..10).map(|i| feature(50.0 * f64::from(i), 100.0, Descriptor([1 << i, 0, 0, 0]))).collect();
+        let features = Arc::new(FrameFeatures::new(list, &PINHOLE));
+        let keyframe = Keyframe {
+            frame_index: 0,
+            timestamp_s: 0.0,
+            camera_from_world: Se3::identity(),
+            features,
+            landmarks: vec![None; 10],
+        };
+        Map { keyframes: vec![keyframe; 3], ..Default::default() }
+    }
+
+    fn at(keyframe: usize, feature: usize) -> Observation {
+        Observation { keyframe, feature }
+    }
+
+    #[test]
+    fn merging_moves_sightings_and_keeps_both_sides_in_step() {
+        let mut map = map();
+        let a = map.add_landmark(at(0, 1), Point3::new(0.0, 0.0, 2.0), &config());
+        let b = map.add_landmark(at(1, 2), Point3::new(0.0, 0.0, 2.0), &config());
+        map.add_observation(b, at(2, 3));
+        map.add_observation(b, at(2, 4)); // a second one in the same keyframe
+        assert_eq!(map.covisible(1), [(2, 1)]);
+        map.merge(b, a);
+        assert_eq!(map.resolve(b), Some(a));
+        assert_eq!(map.landmarks[a].observations, [at(0, 1), at(1, 2), at(2, 3)]);
+        assert_eq!((map.keyframes[1].landmarks[2], map.keyframes[2].landmarks[4]), (Some(a), None));
+        assert_eq!(map.covisible(0), [(2, 1), (1, 1)]);
+        map.remove_observation(a, at(0, 1));
+        map.remove_landmark(a);
+        assert_eq!(map.resolve(b), None);
+        assert!(map.keyframes.iter().all(|k| k.landmarks.iter().all(Option::is_none)));
+    }
+
+    #[test]
+    fn a_landmark_is_predicted_where_and_how_large_it_was_seen() {
+        let mut map = map();
+        let id = map.add_landmark(at(0, 1), Point3::new(0.0, 0.0, 2.0), &config());
+        let predict = |pose: &Se3| map.predict(id, pose, &PINHOLE, &config());
+        let here = predict(&Se3::identity()).unwrap();
+        assert_eq!((here.octave, here.inverse_depth), (0, 0.5));
+        assert!((here.pixel - Vector2::new(320.5, 241.0)).norm() < 1e-9);
+        // Half the distance shows it twice as large: 4 levels of 1.2 up.
+        assert_eq!(predict(&Se3::translation(0.0, 0.0, -1.0)).unwrap().octave, 4);
+        assert!(predict(&Se3::translation(0.0, 0.0, 2.0)).is_none(), "too small to see");
+        assert!(predict(&Se3::translation(9.0, 0.0, 0.0)).is_none(), "out of the image");
+        // From behind.
+        let behind = Se3::new(Vector3::new(0.0, 0.0, 4.0), Vector3::y() * std::f64::consts::PI);
+        assert!(predict(&behind).is_none());
+    }
+}

@@ -1,0 +1,10 @@
+//! Residuals and least-squares solvers: poses, bundle adjustment, pose graphs, alignment. None knows the map.
+
+pub mod bundle;
+pub mod epipolar;
+pub mod pose;
+pub mod pose_graph;
+pub mod relative_pose;
+pub mod residual;
+pub mod schur;
+pub mod sim3_alignment;

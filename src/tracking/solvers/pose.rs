@@ -1,0 +1,176 @@
+//! The pose of one camera from known points: robust Levenberg-Marquardt on SE(3) with a left perturbation.
+//!
+//! Several rounds; after each, every measurement is judged anew by χ² and may come back. Early rounds use Huber's kernel
+//! (Mur-Artal & Tardós, *ORB-SLAM2*, 2017, sec. III-C). A measurement whose depth alone disagrees keeps its pixel.
+
+use nalgebra::{Matrix3, Matrix6, Point3, Vector3, Vector6};
+
+use crate::geometry::{Pinhole, Se3, se3};
+use crate::tracking::solvers::residual::{InlierClass, Measurement, point_by_pose};
+
+const ROUNDS: usize = 4;
+const STEPS_PER_ROUND: usize = 8;
+/// The last rounds run on what was judged good, without Huber's kernel.
+const ROBUST_ROUNDS: usize = 2;
+/// Steps below this (metres and radians together) have converged.
+const CONVERGED: f64 = 1e-7;
+/// Six unknowns need three pixels at least; with fewer measurements there is nothing to solve.
+const MIN_OBSERVATIONS: usize = 3;
+
+/// A known point and what was measured of it.
+#[derive(Clone, Copy, Debug)]
+pub struct PoseObservation {
+    pub point_in_world: Point3<f64>,
+    pub measurement: Measurement,
+}
+
+/// The result of [`optimise_pose`].
+#[derive(Clone, Debug)]
+pub struct PoseEstimate {
+    pub camera_from_world: Se3,
+    /// One per observation, in their order.
+    pub classes: Vec<InlierClass>,
+    pub inliers: usize,
+}
+
+/// The pose that explains the observations best, from `initial` (camera_from_world). Without enough to go by, `initial` comes back
+/// with every observation an outlier.
+pub fn optimise_pose(pinhole: &Pinhole, initial: &Se3, observations: &[PoseObservation]) -> PoseEstimate {
+    let mut pose = *initial;
+    let mut classes: Vec<InlierClass> = observations
+        .iter()
+        .map(|o| if o.measurement.inverse_depth.is_some() { InlierClass::Full } else { InlierClass::PixelOnly })
+        .collect();
+    for round in 0..ROUNDS {
+        if classes.iter().filter(|t| **t != InlierClass::Outlier).count() < MIN_OBSERVATIONS {
+            return PoseEstimate {
+                camera_from_world: *initial,
+                classes: vec![InlierClass::Outlier; observations.len()],
+                inliers: 0,
+            };
+        }
+        pose = refine(pinhole, &pose, observations, &classes, round < ROBUST_ROUNDS);
+        for (t, o) in classes.iter_mut().zip(observations) {
+            *t = o.measurement.classify(pinhole, &(pose * o.point_in_world).coords);
+        }
+    }
+    let inliers = classes.iter().filter(|t| **t != InlierClass::Outlier).count();
+    PoseEstimate { camera_from_world: pose, classes, inliers }
+}
+
+/// Levenberg-Marquardt over the trusted observations.
+fn refine(pinhole: &Pinhole, initial: &Se3, observations: &[PoseObservation], classes: &[InlierClass], robust: bool) -> Se3 {
+    let mut pose = *initial;
+    let mut lambda = 1e-4;
+    let (mut hessian, mut gradient, mut cost) = linearise(pinhole, &pose, observations, classes, robust);
+    for _ in 0..STEPS_PER_ROUND {
+        let mut damped = hessian;
+        for k in 0..6 {
+            damped[(k, k)] += lambda * hessian[(k, k)] + 1e-9;
+        }
+        let Some(step) = damped.cholesky().map(|c| c.solve(&-gradient)) else { break };
+        let candidate = se3::exp(&step) * pose;
+        let (h, g, candidate_cost) = linearise(pinhole, &candidate, observations, classes, robust);
+        if candidate_cost < cost {
+            (pose, hessian, gradient, cost) = (candidate, h, g, candidate_cost);
+            lambda *= 0.1;
+        } else {
+            lambda *= 10.0;
+        }
+        if step.norm() < CONVERGED {
+            break;
+        }
+    }
+    pose.rotation.renormalize();
+    pose
+}
+
+/// Normal equations and cost. A point behind the camera costs as much as a far outlier, so that no step gains by losing it.
+fn linearise(
+    pinhole: &Pinhole,
+    pose: &Se3,
+    observations: &[PoseObservation],
+    classes: &[InlierClass],
+    robust: bool,
+) -> (Matrix6<f64>, Vector6<f64>, f64) {
+    const BEHIND_COST: f64 = 1e4;
+    let (mut hessian, mut gradient, mut cost) = (Matrix6::zeros(), Vector6::zeros(), 0.0);
+    for (o, t) in observations.iter().zip(classes) {
+        let Some(measurement) = o.measurement.restricted_to(*t) else { continue };
+        let p_in_camera = (pose * o.point_in_world).coords;
+        let Some(residual) = measurement.residual(pinhole, &p_in_camera) else {
+            cost += BEHIND_COST;
+            continue;
+        };
+        let (rho, weights) =
+            if robust { Measurement::robust(&residual) } else { (residual.norm_squared(), Vector3::repeat(1.0)) };
+        let j = measurement.jacobian(pinhole, &p_in_camera) * point_by_pose(&p_in_camera);
+        let weighted = j.transpose() * Matrix3::from_diagonal(&weights);
+        hessian += weighted * j;
+        gradient += weighted * residual;
+        cost += rho;
+    }
+    (hessian, gradient, cost)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::tracking::solvers::residual::tests::PINHOLE;
+    use nalgebra::Vector2;
+
+    const PIXEL_SIGMA: f64 = 0.8;
+    const DEPTH_SIGMA: f64 = 0.01;
+
+    fn gauss(random: &mut fastrand::Rng) -> f64 {
+        (0..12).map(|_| random.f64()).sum::<f64>() - 6.0
+    }
+
+    /// 300 points before the camera; every fourth pixel and every fifth depth is wrong.
+    fn scene(truth: &Se3, with_depth: bool) -> Vec<PoseObservation> {
+        let mut random = fastrand::Rng::with_seed(11);
+        (0..300)
+            .map(|i| {
+                let pixel = Vector2::new(random.f64() * 640.0, random.f64() * 480.0);
+                let depth = 0.7 + 3.0 * random.f64();
+                let point_in_world = truth.inverse() * Point3::from(PINHOLE.unproject(&pixel, depth));
+                let noise = Vector2::new(gauss(&mut random), gauss(&mut random)) * PIXEL_SIGMA;
+                let wrong_pixel = if i % 4 == 0 { Vector2::new(random.f64() * 80.0 + 10.0, -30.0) } else { Vector2::zeros() };
+                let wrong_depth = if i % 5 == 0 { 0.4 } else { 0.0 };
+                let measurement = Measurement {
+                    pixel: pixel + noise + wrong_pixel,
+                    inverse_depth: with_depth.then(|| 1.0 / depth + gauss(&mut random) * DEPTH_SIGMA + wrong_depth),
+                    pixel_weight: 1.0 / PIXEL_SIGMA,
+                    depth_weight: 1.0 / DEPTH_SIGMA,
+                };
+                PoseObservation { point_in_world, measurement }
+            })
+            .collect()
+    }
+
+    #[test]
+    fn finds_the_pose_among_outliers() {
+        let truth = se3::exp(&Vector6::new(0.3, -0.2, 0.4, 0.2, -0.1, 0.3));
+        let initial = se3::exp(&Vector6::new(0.08, -0.05, 0.06, 0.04, 0.03, -0.04)) * truth;
+        for with_depth in [true, false] {
+            let found = optimise_pose(&PINHOLE, &initial, &scene(&truth, with_depth));
+            let error = se3::log(&(found.camera_from_world * truth.inverse()));
+            assert!(error.fixed_rows::<3>(0).norm() < 2e-3 && error.fixed_rows::<3>(3).norm() < 1e-3, "{error}");
+            for (i, classes) in found.classes.iter().enumerate() {
+                if i % 4 == 0 {
+                    assert_eq!(*classes, InlierClass::Outlier, "observation {i}");
+                } else if with_depth && i % 5 == 0 {
+                    assert_ne!(*classes, InlierClass::Full, "observation {i}");
+                }
+            }
+            assert!(found.inliers > 190 && found.inliers <= 225, "{} inliers", found.inliers);
+        }
+    }
+
+    #[test]
+    fn with_nothing_to_go_by_the_initial_pose_comes_back() {
+        let initial = se3::exp(&Vector6::new(0.3, -0.2, 0.4, 0.2, -0.1, 0.3));
+        let found = optimise_pose(&PINHOLE, &initial, &scene(&initial, true)[..2]);
+        assert_eq!((found.camera_from_world, found.inliers), (initial, 0));
+    }
+}

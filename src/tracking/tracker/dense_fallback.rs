@@ -1,0 +1,52 @@
+//! RGB-D frames whose features do not give a pose: all pixels do, for a while.
+
+use std::sync::Arc;
+
+use super::Tracker;
+use crate::geometry::Se3;
+use crate::tracking::features::frame_features::FrameFeatures;
+use crate::tracking::localisation::dense_alignment::{DenseFrame, align};
+use crate::tracking::localisation::localise::LastFrame;
+use crate::tracking::localisation::localise::{Context, Localised};
+
+/// Frames without a pose after which pixels no longer say where the camera is.
+const MAX_FRAMES_BRIDGED: usize = 2;
+/// Overlap from which on the newest keyframe is the better reference than the last frame.
+const KEYFRAME_OVERLAP: f64 = 0.5;
+
+impl Tracker {
+    /// The frame's pose from all its pixels, where features did not give it: against the last frame, then against the newest keyframe,
+    /// which drifts less.
+    pub(super) fn localise_densely(
+        &mut self,
+        dense: Option<&DenseFrame>,
+        features: &FrameFeatures,
+        last: &LastFrame,
+        guess: Option<Se3>,
+    ) -> Option<Localised> {
+        if self.frames_lost > MAX_FRAMES_BRIDGED {
+            return None;
+        }
+        let (frame, before) = (dense?, self.dense_last.as_ref()?);
+        let mut guesses = vec![self.velocity.unwrap_or_default(), Se3::identity()];
+        guesses.extend(guess.map(|pose| pose * last.camera_from_world.inverse()));
+        let mut camera_from_world = align(before, frame, &guesses)?.current_from_reference * last.camera_from_world;
+        if let Some((keyframe, view)) = &self.dense_keyframe {
+            let pose = self.map.keyframes[*keyframe].camera_from_world;
+            let guess = camera_from_world * pose.inverse();
+            if let Some(found) = align(view, frame, &[guess]).filter(|found| found.overlap >= KEYFRAME_OVERLAP) {
+                camera_from_world = found.current_from_reference * pose;
+            }
+        }
+        let mut context = Context { map: &mut self.map, pinhole: &self.camera.pinhole, config: &self.config };
+        Some(context.at_pose(features, camera_from_world, self.reference))
+    }
+
+    /// Keeps a tracked frame's pixels for the next.
+    pub(super) fn keep_dense(&mut self, dense: Option<Arc<DenseFrame>>, is_keyframe: bool) {
+        if is_keyframe {
+            self.dense_keyframe = dense.clone().map(|view| (self.map.keyframes.len() - 1, view));
+        }
+        self.dense_last = dense;
+    }
+}

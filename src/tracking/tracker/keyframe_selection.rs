@@ -1,0 +1,40 @@
+//! When a frame becomes a keyframe: by how little of the reference keyframe is still seen, and by how far the camera has moved.
+
+use crate::tracking::TrackingConfig;
+use crate::tracking::features::frame_features::FrameFeatures;
+use crate::tracking::localisation::localise::Localised;
+use crate::tracking::map::sparse_map::Map;
+
+/// Landmarks that only one keyframe has seen count towards the reference keyframe's only while the map is this young.
+const YOUNG_MAP: usize = 3;
+/// With fewer tracked points within depth than this, and more new ones than that, the view has changed enough.
+const FEW_TRACKED: usize = 100;
+const MANY_NEW: usize = 100;
+/// Share of the motion thresholds that the camera must have moved before a smaller overlap counts: a frame that is only blurred loses
+/// landmarks too, and keyframes from one place hold the map by nothing.
+const LEAST_MOTION: f64 = 0.25;
+/// Below this overlap the motion no longer matters.
+const LOW_OVERLAP: f64 = 0.25;
+
+/// Whether a tracked frame should become a keyframe; `reference` is the keyframe that shares most landmarks with it.
+pub fn is_due(map: &Map, frame: &FrameFeatures, found: &Localised, reference: usize, config: &TrackingConfig) -> bool {
+    let view = &map.keyframes[reference];
+    let observations = if map.keyframes.len() < YOUNG_MAP { 1 } else { 2 };
+    let expected = view.landmark_count(map, observations);
+    let overlap = found.inliers as f64 / expected.max(1) as f64;
+
+    let camera_from_reference = found.camera_from_world * view.camera_from_world.inverse();
+    let depth = frame.median_depth().or_else(|| map.median_depth(reference)).unwrap_or(1.0);
+    // 1 where the camera has moved or turned as far as a keyframe needs.
+    let moved = camera_from_reference.translation.vector.norm() / (config.keyframe_translation * depth);
+    let turned = camera_from_reference.rotation.angle() / config.keyframe_rotation_rad;
+    let motion = moved.max(turned);
+
+    let with_depth = |tracked: bool| {
+        let pairs = frame.features.iter().zip(&found.landmarks);
+        pairs.filter(|(f, l)| f.depth_metres.is_some() && l.is_some() == tracked).count()
+    };
+    let new_view = with_depth(true) < FEW_TRACKED && with_depth(false) > MANY_NEW;
+    let changed = overlap < config.keyframe_overlap || new_view;
+    motion > 1.0 || overlap < LOW_OVERLAP || (changed && motion > LEAST_MOTION)
+}

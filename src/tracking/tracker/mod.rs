@@ -1,0 +1,340 @@
+//! The tracker: one frame at a time to a pose, and now and then a keyframe. Owns the map; runs in the caller's thread, with bundle
+//! adjustment in a thread of its own.
+//!
+//! It leaves out what the rest of the project does elsewhere: rendering.
+
+mod adjusting;
+mod dense_fallback;
+mod keyframe_selection;
+mod start;
+
+use std::collections::BTreeSet;
+use std::sync::Arc;
+use std::time::Instant;
+
+use adjusting::Adjusting;
+
+use crate::geometry::{Camera, Se3, StampedPose};
+use crate::sequence::{Frame, Sensor};
+use crate::tracking::adjustment::thread::Worker;
+use crate::tracking::features::frame_features::{FrameFeatures, luma};
+use crate::tracking::features::orb::Extractor;
+use crate::tracking::initialisation::mono::FirstView;
+use crate::tracking::localisation::dense_alignment::{DenseFrame, DenseSampler};
+use crate::tracking::localisation::localise::{Context, LastFrame, Localised};
+use crate::tracking::loop_closing::LoopCloser;
+use crate::tracking::map::insertion;
+use crate::tracking::map::sparse_map::{Keyframe, Map};
+use crate::tracking::map::triangulation;
+use crate::tracking::{KeyframePose, NewKeyframe, StageTimes, TrackedFrame, TrackingConfig, TrackingError, TrackingState};
+
+/// For this many frames after the camera was found again, poses are held to the stricter count.
+const FRESHLY_FOUND_FRAMES: usize = 5;
+
+/// With fewer landmarks than this a pose is checked against all pixels, where there is depth.
+const FEW_INLIERS: usize = 50;
+/// Without depth, keyframes further apart are worth more: a window then spans a wider baseline, which is all that fixes the points.
+const MONO_SPACING: f64 = 1.65;
+
+/// A true pose agrees with well over half of its matches, one by chance with few.
+const MIN_INLIER_SHARE: f64 = 0.35;
+
+/// The tracker, for any sensor.
+#[derive(Debug)]
+pub struct Tracker {
+    camera: Camera,
+    sensor: Sensor,
+    config: TrackingConfig,
+    extractor: Extractor,
+    map: Map,
+    loops: LoopCloser,
+    /// The last frame with a pose; `None` before the map is started.
+    last: Option<LastFrame>,
+    /// The frame that a map without depth may start from.
+    first_view: Option<FirstView>,
+    /// camera_from_last_camera, as of the last two frames in a row.
+    velocity: Option<Se3>,
+    /// Keyframe that shares most landmarks with the last frame.
+    reference: usize,
+    lost: bool,
+    /// In a row, until now.
+    frames_lost: usize,
+    frames_since_found: usize,
+    frames_seen: usize,
+    /// For RGB-D: the last tracked frame and the newest keyframe as [`align`] takes them.
+    sampler: Option<DenseSampler>,
+    dense_last: Option<Arc<DenseFrame>>,
+    dense_keyframe: Option<(usize, Arc<DenseFrame>)>,
+    records: Vec<Record>,
+    adjusting: Adjusting,
+    /// Keyframes that moved since the last frame's answer.
+    moved: BTreeSet<usize>,
+}
+
+/// A tracked frame, held by its reference keyframe.
+#[derive(Clone, Copy, Debug)]
+struct Record {
+    frame_index: usize,
+    timestamp_s: f64,
+    reference: usize,
+    camera_from_reference: Se3,
+}
+
+impl Tracker {
+    /// A tracker for one camera.
+    ///
+    /// # Errors
+    /// [`TrackingError::Config`] if a setting is out of its range, [`TrackingError::Spawn`] if the system gives no thread.
+    pub fn new(camera: Camera, sensor: Sensor, config: &TrackingConfig) -> Result<Self, TrackingError> {
+        config.validate().map_err(TrackingError::Config)?;
+        let spacing = if sensor == Sensor::Mono { MONO_SPACING } else { 1.0 };
+        let config = TrackingConfig {
+            keyframe_translation: spacing * config.keyframe_translation,
+            keyframe_rotation_rad: spacing * config.keyframe_rotation_rad,
+            ..config.clone()
+        };
+        let worker = Worker::start(camera.pinhole, config.bundle_iterations)?;
+        Ok(Self {
+            camera,
+            sensor,
+            extractor: Extractor::new(camera.pinhole.width, camera.pinhole.height, &config),
+            config,
+            map: Map::default(),
+            loops: LoopCloser::default(),
+            last: None,
+            first_view: None,
+            velocity: None,
+            reference: 0,
+            lost: false,
+            frames_lost: 0,
+            sampler: (sensor == Sensor::Rgbd).then(|| DenseSampler::new(&camera)),
+            dense_last: None,
+            dense_keyframe: None,
+            frames_since_found: FRESHLY_FOUND_FRAMES,
+            frames_seen: 0,
+            records: Vec::new(),
+            adjusting: Adjusting::new(worker),
+            moved: BTreeSet::new(),
+        })
+    }
+
+    /// Paced replay, where frames do not wait: bundle adjustment is taken in when it is ready instead of at a fixed frame. What comes
+    /// out then depends on how fast the machine is.
+    #[must_use]
+    pub fn paced(mut self, paced: bool) -> Self {
+        self.adjusting.paced = paced;
+        self
+    }
+
+    /// Tracks the next frame. `may_be_keyframe` is false for frames that are held out from the mapper; until there is a map, such
+    /// frames are Lost.
+    ///
+    /// # Errors
+    /// If the very first frame has no depth, if an image's size is not the camera's, or if OpenCV fails.
+    pub fn track(&mut self, frame: &Frame, may_be_keyframe: bool) -> Result<TrackedFrame, TrackingError> {
+        self.check(frame)?;
+        self.frames_seen += 1;
+        let mut times = StageTimes::default();
+        let clock = Instant::now();
+        let grey = luma(&frame.color);
+        let setting = (&self.camera, self.sensor);
+        let features = Arc::new(FrameFeatures::of_frame((frame, &grey), setting, &self.extractor, &self.config)?);
+        let sampled = self.sampler.as_ref().zip(frame.depth.as_ref());
+        let dense = sampled.map(|(sampler, depth)| Arc::new(sampler.sample(&grey, depth, &self.config)));
+        times.features_ms = milliseconds(clock);
+        self.take_adjusted(&mut times)?;
+        let mut tracked = match self.last.take() {
+            Some(last) => self.go_on(frame, features, dense.as_deref(), last, may_be_keyframe, times)?,
+            None if self.sensor == Sensor::Mono => self.start_without_depth(frame, features, may_be_keyframe, times),
+            None => self.start(frame, features, may_be_keyframe, times),
+        };
+        if tracked.state == TrackingState::Tracking {
+            self.keep_dense(dense, tracked.keyframe.is_some());
+        }
+        tracked.updates = self.updates();
+        Ok(tracked)
+    }
+
+    /// Tracks a frame when there is a map.
+    fn go_on(
+        &mut self,
+        frame: &Frame,
+        features: Arc<FrameFeatures>,
+        dense: Option<&DenseFrame>,
+        last: LastFrame,
+        may_be_keyframe: bool,
+        mut times: StageTimes,
+    ) -> Result<TrackedFrame, TrackingError> {
+        let clock = Instant::now();
+        let mut found = self.localise(&features, &last);
+        if found.as_ref().is_none_or(|f| f.inliers < FEW_INLIERS) {
+            let guess = found.as_ref().map(|f| f.camera_from_world);
+            found = self.localise_densely(dense, &features, &last, guess).or(found);
+        }
+        times.localise_ms = milliseconds(clock);
+        if let Some(found) = found {
+            return self.accept(frame, features, &last, found, may_be_keyframe, times);
+        }
+        self.last = Some(last);
+        self.frames_lost += 1;
+        self.lost = true;
+        self.velocity = None;
+        Ok(TrackedFrame::lost(times))
+    }
+
+    /// Final pose of every tracked frame (index in the sequence, pose), each carried by its reference keyframe so that later
+    /// corrections of keyframes move it. Lost frames are absent.
+    pub fn trajectory(&self) -> Vec<(usize, StampedPose)> {
+        let pose = |r: &Record| (r.camera_from_reference * self.map.keyframes[r.reference].camera_from_world).inverse();
+        self.records
+            .iter()
+            .map(|r| (r.frame_index, StampedPose { timestamp_s: r.timestamp_s, world_from_camera: pose(r) }))
+            .collect()
+    }
+
+    /// All keyframes with their current poses; a keyframe's id is its place.
+    pub fn keyframes(&self) -> Vec<KeyframePose> {
+        let pose = |(id, k): (usize, &Keyframe)| KeyframePose {
+            id,
+            frame_index: k.frame_index,
+            timestamp_s: k.timestamp_s,
+            world_from_camera: k.camera_from_world.inverse(),
+        };
+        self.map.keyframes.iter().enumerate().map(pose).collect()
+    }
+
+    /// How many keyframes have not been culled.
+    pub fn living_keyframes(&self) -> usize {
+        self.map.keyframes.len() - self.map.culled.len()
+    }
+
+    fn check(&self, frame: &Frame) -> Result<(), TrackingError> {
+        let (width, height) = (self.camera.pinhole.width, self.camera.pinhole.height);
+        let size = |what, (found_width, found_height)| {
+            let good = (found_width, found_height) == (width, height);
+            let error = TrackingError::Size { frame: frame.index, what, width, height, found_width, found_height };
+            if good { Ok(()) } else { Err(error) }
+        };
+        size("colour", frame.color.dimensions())?;
+        match &frame.depth {
+            Some(depth) => size("depth", (depth.width, depth.height)),
+            None if self.frames_seen == 0 && self.sensor == Sensor::Rgbd => {
+                Err(TrackingError::FirstFrameWithoutDepth { frame: frame.index })
+            }
+            None => Ok(()),
+        }
+    }
+
+    /// The frame's pose, if it can be trusted.
+    fn localise(&mut self, features: &FrameFeatures, last: &LastFrame) -> Option<Localised> {
+        let strict = self.lost || self.frames_since_found < FRESHLY_FOUND_FRAMES;
+        let needed = if strict { self.config.min_relocalisation_inliers } else { self.config.min_inliers };
+        let reference = self.reference;
+        let predicted = self.velocity.unwrap_or_default() * last.camera_from_world;
+        let mut context = Context { map: &mut self.map, pinhole: &self.camera.pinhole, config: &self.config };
+        let mut found = None;
+        if !self.lost {
+            let view = context.view_of_last(last);
+            if let Some(start) = context.with_motion_model(features, &view, &predicted) {
+                found = Some(context.in_local_map(features, &start, reference)).filter(|f| f.inliers >= needed);
+            }
+            if found.is_none()
+                && let Some(start) = context
+                    .against_view(features, &view)
+                    .or_else(|| context.against_view(features, &context.view_of_keyframe(reference)))
+            {
+                found = Some(context.in_local_map(features, &start, reference)).filter(|f| f.inliers >= needed);
+            }
+        }
+        if found.is_none() {
+            let needed = self.config.min_relocalisation_inliers;
+            found = context.relocalise(features, reference).filter(|f| f.inliers >= needed);
+        }
+        let trusted = |f: &Localised| {
+            let finite = f.camera_from_world.to_homogeneous().iter().all(|v| v.is_finite());
+            finite && f.inliers as f64 >= MIN_INLIER_SHARE * f.matches as f64
+        };
+        found.filter(trusted)
+    }
+
+    /// Takes a trusted pose in: motion, reference, record, and a keyframe if one is due.
+    fn accept(
+        &mut self,
+        frame: &Frame,
+        features: Arc<FrameFeatures>,
+        last: &LastFrame,
+        found: Localised,
+        may_be_keyframe: bool,
+        mut times: StageTimes,
+    ) -> Result<TrackedFrame, TrackingError> {
+        self.frames_since_found = if self.lost { 0 } else { self.frames_since_found + 1 };
+        self.velocity = (!self.lost).then(|| found.camera_from_world * last.camera_from_world.inverse());
+        self.lost = false;
+        self.frames_lost = 0;
+        let covisibility = self.map.covisibility(found.landmarks.iter().flatten().copied());
+        self.reference = covisibility.first().map_or(self.reference, |(k, _)| *k);
+        let due = may_be_keyframe && keyframe_selection::is_due(&self.map, &features, &found, self.reference, &self.config);
+        let Localised { camera_from_world, landmarks, inliers, dense, .. } = found;
+        let camera_from_reference = camera_from_world * self.map.keyframes[self.reference].camera_from_world.inverse();
+        self.record(frame, self.reference, camera_from_reference);
+        self.last = Some(LastFrame { features, camera_from_world, landmarks });
+        let new_keyframe = if due { self.make_keyframe(frame, !dense, &mut times)? } else { None };
+        Ok(TrackedFrame {
+            state: TrackingState::Tracking,
+            world_from_camera: self.last.as_ref().map(|l| l.camera_from_world.inverse()),
+            inliers,
+            keyframe: new_keyframe,
+            updates: Vec::new(),
+            times,
+        })
+    }
+
+    /// Makes the frame that was just tracked a keyframe. `held`: by landmarks, instead of by all pixels.
+    fn make_keyframe(&mut self, frame: &Frame, held: bool, times: &mut StageTimes) -> Result<Option<NewKeyframe>, TrackingError> {
+        self.settle_for_keyframe(times)?;
+        let Some(LastFrame { features, camera_from_world, landmarks }) = self.last.take() else { return Ok(None) };
+        let (pinhole, config) = (&self.camera.pinhole, &self.config);
+        let clock = Instant::now();
+        let keyframe = Keyframe {
+            frame_index: frame.index,
+            timestamp_s: frame.timestamp_s,
+            camera_from_world,
+            features: features.clone(),
+            landmarks,
+        };
+        let id = insertion::insert_keyframe(&mut self.map, keyframe, pinhole, config);
+        triangulation::triangulate_with_neighbours(&mut self.map, id, pinhole, config);
+        insertion::fuse_with_neighbours(&mut self.map, id, pinhole, config);
+        insertion::cull_recent_landmarks(&mut self.map, id);
+        times.mapping_ms += milliseconds(clock);
+        self.reference = id;
+        self.records.pop();
+        self.record(frame, id, Se3::identity());
+        self.last = Some(LastFrame { features, camera_from_world, landmarks: self.map.keyframes[id].landmarks.clone() });
+        self.adjust_around(id, held, times)?;
+        // Its pose goes out with itself.
+        self.moved.remove(&id);
+        Ok(Some(self.describe(id)))
+    }
+
+    /// What the mapper is told of a keyframe.
+    fn describe(&self, id: usize) -> NewKeyframe {
+        let keyframe = &self.map.keyframes[id];
+        let depth = |l: usize| (keyframe.camera_from_world * self.map.landmarks[l].position).z;
+        let pairs = keyframe.features.features.iter().zip(&keyframe.landmarks);
+        let seen = match self.sensor {
+            Sensor::Rgbd => Vec::new(),
+            _ => pairs.filter_map(|(f, l)| l.map(|l| (f.pixel, depth(l)))).filter(|(_, z)| *z > 0.0).collect(),
+        };
+        let world_from_camera = keyframe.camera_from_world.inverse();
+        NewKeyframe { id, world_from_camera, seen, covisible: self.map.covisible(id) }
+    }
+
+    fn record(&mut self, frame: &Frame, reference: usize, camera_from_reference: Se3) {
+        self.records.push(Record { frame_index: frame.index, timestamp_s: frame.timestamp_s, reference, camera_from_reference });
+    }
+}
+
+fn milliseconds(since: Instant) -> f64 {
+    since.elapsed().as_secs_f64() * 1e3
+}
