@@ -13,7 +13,7 @@ build: setup
 	cargo build --release
 
 test: setup
-	cargo test --release
+	@scripts/test.sh
 
 check: setup
 	cargo fmt --check

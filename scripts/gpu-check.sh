@@ -10,16 +10,14 @@ out=${1:-benches/results}
 mkdir -p "$out"
 if command -v cargo >/dev/null 2>&1; then
     cargo build --release
-    cargo test --release --no-run
+    cargo test --release --test gpu --no-run
 fi
 
 target/release/keysplat adapters
-for test in gpu_against_reference gpu_properties gpu_failures; do
-    # The newest build of the test.
-    binary=$(find target/release/deps -maxdepth 1 -name "$test-*" -type f -perm -u+x -exec ls -t {} + | head -n 1)
-    [ -n "$binary" ] || { echo "gpu-check: $test is not built" >&2; exit 1; }
-    "$binary"
-done
+# The newest build of the shaders' tests.
+binary=$(find target/release/deps -maxdepth 1 -name "gpu-*" -type f -perm -u+x -exec ls -t {} + | head -n 1)
+[ -n "$binary" ] || { echo "gpu-check: the tests are not built" >&2; exit 1; }
+KEYSPLAT_REQUIRE=adapter "$binary"
 
 repeats=$(mktemp -d)
 trap 'rm -rf "$repeats"' EXIT

@@ -3,6 +3,7 @@
 
 pub mod pairs;
 pub mod recording;
+pub mod requirements;
 
 use fastrand::Rng;
 use glam::{Quat, Vec3};

@@ -10,6 +10,7 @@ use std::process::{Child, Command, Stdio};
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
+use super::requirements::skip;
 use keysplat::evaluation::Metrics;
 use keysplat::gpu::Gpu;
 use keysplat::synthetic::{self, CameraConfig, FurnitureConfig, SceneConfig};
@@ -29,12 +30,12 @@ const HANGS_AFTER: Duration = Duration::from_secs(180);
 /// What a graphics driver says on standard error by itself.
 const DRIVER_LINES: [&str; 2] = ["error: XDG_RUNTIME_DIR", "WARNING: "];
 
-/// This test binary's folder for files.
-pub fn scratch() -> &'static Path {
+/// This test binary's folder for files, emptied when the binary starts.
+fn binary_scratch() -> &'static Path {
     static FOLDER: OnceLock<PathBuf> = OnceLock::new();
     FOLDER.get_or_init(|| {
         let binary = std::env::current_exe().unwrap();
-        // `bad_input-<hash>`
+        // `program-<hash>`
         let name = binary.file_stem().unwrap().to_str().unwrap().rsplit_once('-').unwrap().0.to_owned();
         let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join(name);
         if folder.exists() {
@@ -43,6 +44,15 @@ pub fn scratch() -> &'static Path {
         std::fs::create_dir_all(&folder).unwrap();
         folder
     })
+}
+
+/// The folder for files of the calling module.
+#[track_caller]
+pub fn scratch() -> PathBuf {
+    let module = Path::new(std::panic::Location::caller().file()).file_stem().unwrap();
+    let folder = binary_scratch().join(module);
+    std::fs::create_dir_all(&folder).unwrap();
+    folder
 }
 
 /// A short sweep across a sparsely furnished room, at the smallest usual size that is tracked well.
@@ -57,13 +67,14 @@ pub fn scene() -> SceneConfig {
 pub fn recording() -> &'static Path {
     static RECORDING: OnceLock<PathBuf> = OnceLock::new();
     RECORDING.get_or_init(|| {
-        let folder = scratch().join("recording");
+        let folder = binary_scratch().join("recording");
         synthetic::generate(&scene(), &folder, &|_, _| {}).unwrap();
         folder
     })
 }
 
 /// A copy of the recording under another name, to be spoilt.
+#[track_caller]
 pub fn copy_of_recording(name: &str) -> PathBuf {
     let to = scratch().join(name);
     copy_folder(recording(), &to);
@@ -105,6 +116,7 @@ pub fn change_line(file: &Path, number: usize, change: impl FnOnce(&str) -> Stri
 }
 
 /// A configuration with few steps, and more lines behind them.
+#[track_caller]
 pub fn write_config(name: &str, more: &str) -> PathBuf {
     let path = scratch().join(name);
     let mapping =
@@ -113,12 +125,12 @@ pub fn write_config(name: &str, more: &str) -> PathBuf {
     path
 }
 
-/// Says so and returns true where no adapter can run the mapper.
+/// Skips the calling test where no adapter can run the mapper; returns whether it did.
 pub fn skipped_without_adapter() -> bool {
     static ERROR: OnceLock<Option<String>> = OnceLock::new();
     let error = ERROR.get_or_init(|| Gpu::open(None).err().map(|e| e.to_string()));
     if let Some(error) = error {
-        eprintln!("SKIPPED, this test runs the mapper: {error}");
+        skip("adapter", error);
     }
     error.is_some()
 }

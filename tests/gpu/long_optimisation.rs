@@ -1,12 +1,9 @@
 //! Many steps on degenerate scenes and images that cannot be fitted: nothing may become NaN, explode, or grow into a needle. Needs an
 //! adapter; says so loudly and passes where there is none.
 
-mod common;
-
 use fastrand::Rng;
 use glam::Vec3;
 use image::{Rgb, RgbImage};
-use keysplat::gpu::Gpu;
 use keysplat::optimise::{AdamConfig, LossConfig, Optimiser, TargetImage, TileSkip, TrainingView};
 use keysplat::render::{GpuCloud, Rasterizer};
 use keysplat::splat::ShDegree;
@@ -24,28 +21,25 @@ fn elongation(log_scale: Vec3) -> f32 {
 
 #[test]
 fn two_hundred_steps_on_noise_end_finite() {
-    let Ok(gpu) = Gpu::open(None) else {
-        eprintln!("SKIPPED, long optimisations were not tried: no adapter");
-        return;
-    };
+    let Some(gpu) = crate::common::requirements::adapter() else { return };
     let adam = AdamConfig::default();
     let mut rasterizer = Rasterizer::new(gpu.clone()).unwrap();
     let mut optimiser = Optimiser::new(&rasterizer).unwrap();
     let mut blunted = 0;
     for seed in 0..SCENES {
         let mut rng = Rng::with_seed(900 + seed);
-        let camera = common::camera(&mut rng, 48, 32);
-        let mut cloud = common::scene(&mut rng, 60, ShDegree::ALL[2]);
+        let camera = crate::common::camera(&mut rng, 48, 32);
+        let mut cloud = crate::common::scene(&mut rng, 60, ShDegree::ALL[2]);
         for i in (0..cloud.len()).step_by(4) {
-            cloud.log_scales[i].x += common::between(&mut rng, -6.0, 6.0);
-            cloud.raw_opacities[i] = common::between(&mut rng, -8.0, 20.0);
+            cloud.log_scales[i].x += crate::common::between(&mut rng, -6.0, 6.0);
+            cloud.raw_opacities[i] = crate::common::between(&mut rng, -8.0, 20.0);
         }
         let mut on_gpu = GpuCloud::new(&gpu, cloud.sh_degree, cloud.len()).unwrap();
         on_gpu.append(&gpu, &cloud).unwrap();
         // Noise, and a depth that has nothing to do with the scene.
         let image = RgbImage::from_fn(48, 32, |_, _| Rgb([rng.u8(..), rng.u8(..), rng.u8(..)]));
         let depth: Vec<f32> =
-            (0..48 * 32).map(|_| if rng.f32() < 0.2 { 0.0 } else { common::between(&mut rng, 0.05, 60.0) }).collect();
+            (0..48 * 32).map(|_| if rng.f32() < 0.2 { 0.0 } else { crate::common::between(&mut rng, 0.05, 60.0) }).collect();
         let target = TargetImage::new(&gpu, &image, Some(&depth)).unwrap();
         let skip = (seed % 2 == 1).then_some(TileSkip { share: 0.5, least: 0.1, noise: 0.0 });
         let view = TrainingView { skip, ..TrainingView::new(camera, &target) };

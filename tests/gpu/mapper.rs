@@ -1,5 +1,6 @@
 //! The mapper, keyframe by keyframe.
 
+use crate::common::requirements::adapter;
 use std::sync::Arc;
 
 use image::{Rgb, RgbImage};
@@ -19,13 +20,9 @@ fn keyframe(id: usize, with_depth: bool) -> Keyframe {
     Keyframe { id, world_from_camera, image, depth_source: DepthSource::Sensor, covisible: Vec::new() }
 }
 
-fn gpu() -> Option<Arc<Gpu>> {
-    Gpu::open(None).inspect_err(|error| eprintln!("SKIPPED, nothing was mapped: {error}")).ok()
-}
-
 #[test]
 fn density_is_controlled_after_every_so_many_keyframes() {
-    let Some(gpu) = gpu() else { return };
+    let Some(gpu) = adapter() else { return };
     for every in [1, 2, 3] {
         let mut config = MappingConfig { first_iterations: 5, iterations_per_keyframe: 5, ..Default::default() };
         // No seed is as opaque as this.
@@ -43,7 +40,7 @@ fn density_is_controlled_after_every_so_many_keyframes() {
 /// Each keyframe shows another place, so there is always more to seed.
 #[test]
 fn memory_is_held_however_much_there_is_to_map() {
-    let Some(free) = gpu() else { return };
+    let Some(free) = adapter() else { return };
     let steps = MappingConfig { first_iterations: 5, iterations_per_keyframe: 5, ..Default::default() };
     let elsewhere = |id| Keyframe { world_from_camera: Se3::translation(5.0 * id as f64, 0.0, 0.0), ..keyframe(id, true) };
     let walk = |gpu: &Arc<Gpu>, config: &MappingConfig| -> Vec<usize> {
@@ -54,7 +51,7 @@ fn memory_is_held_however_much_there_is_to_map() {
     let limit = free.peak_bytes() * 3 / 5;
     let mut config = steps.clone();
     config.limits.max_gpu_bytes = Some(limit);
-    let Some(bounded) = gpu() else { return };
+    let Some(bounded) = adapter() else { return };
     let held = walk(&bounded, &config);
     assert!(bounded.peak_bytes() <= limit, "{} of {limit} bytes", bounded.peak_bytes());
     assert_eq!(held[..10], unbounded[..10], "as long as there is room, the limit changes nothing");
@@ -64,7 +61,7 @@ fn memory_is_held_however_much_there_is_to_map() {
 /// A camera may see nothing near at first: the map begins with the first keyframe that has depth.
 #[test]
 fn keyframes_before_the_first_depth_are_passed_over() {
-    let Some(gpu) = gpu() else { return };
+    let Some(gpu) = adapter() else { return };
     let config = MappingConfig { first_iterations: 5, iterations_per_keyframe: 5, ..Default::default() };
     let mut mapper = Mapper::new(gpu.clone(), &config).unwrap();
     for id in 0..2 {

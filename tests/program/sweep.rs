@@ -1,8 +1,6 @@
 //! Sweeps as the program makes them: tables and curves, going on where one was interrupted, and one sweep against another.
 
-mod common;
-
-use common::recording::{Finished, finish, keysplat, recording, scratch, skipped_without_adapter};
+use crate::common::recording::{Finished, finish, keysplat, recording, scratch, skipped_without_adapter};
 use keysplat::config::Config;
 use keysplat::mapping::MappingConfig;
 use std::path::Path;

@@ -42,7 +42,7 @@ fn picture(width: usize, height: usize, kind: Kind) -> ImageF32 {
 
 #[test]
 fn figures_are_those_of_scikit_image() {
-    let references: Vec<Reference> = serde_json::from_str(include_str!("fixtures/scikit-image/figures.json")).unwrap();
+    let references: Vec<Reference> = serde_json::from_str(include_str!("../fixtures/scikit-image/figures.json")).unwrap();
     assert_eq!(references.len(), 5);
     for reference in references {
         let Reference { width, height, kind, .. } = reference;

@@ -1,10 +1,8 @@
 //! What happens when the GPU gives way in the middle of a run: a typed error, and everything mapped until then.
 
-mod common;
-
 use std::time::Duration;
 
-use common::recording::{ITERATIONS_PER_KEYFRAME, recording, scratch, skipped_without_adapter};
+use crate::common::recording::{ITERATIONS_PER_KEYFRAME, recording, scratch, skipped_without_adapter};
 use fastrand::Rng;
 use keysplat::export::MapFormat;
 use keysplat::gpu::{Gpu, GpuError};
@@ -69,24 +67,24 @@ fn buffers_beyond_the_adapter_are_refused_and_nothing_is_lost() {
     let small = Gpu::open_small(None, LARGEST).unwrap();
     let rng = &mut Rng::with_seed(1);
     let degree = ShDegree::default();
-    let cloud = common::scene(rng, 20_000, degree);
+    let cloud = crate::common::scene(rng, 20_000, degree);
     let mut map = GpuCloud::new(&small, degree, 64).unwrap();
     map.append(&small, &cloud).unwrap();
     let per_gaussian = map.parameters().raw().size() as usize / map.capacity();
     // As many as fit: more than the last power of two below.
     let room = LARGEST as usize / per_gaussian;
     assert!(!room.is_power_of_two() || room > 2 * cloud.len());
-    map.append(&small, &common::scene(rng, room - 1000 - cloud.len(), degree)).unwrap();
-    let refused = map.append(&small, &common::scene(rng, 2000, degree)).unwrap_err();
+    map.append(&small, &crate::common::scene(rng, room - 1000 - cloud.len(), degree)).unwrap();
+    let refused = map.append(&small, &crate::common::scene(rng, 2000, degree)).unwrap_err();
     assert!(matches!(refused, GpuError::TooLarge { needed, limit, .. } if needed > LARGEST && limit == LARGEST), "{refused}");
     assert_eq!(map.len(), room - 1000);
     let kept = map.download(&small).unwrap();
     assert_eq!((kept.get(0), kept.get(19_999)), (cloud.get(0), cloud.get(19_999)));
 
     let mut map = GpuCloud::new(&small, degree, 64).unwrap();
-    map.append(&small, &common::scene(rng, 300, degree)).unwrap();
+    map.append(&small, &crate::common::scene(rng, 300, degree)).unwrap();
     let mut rasterizer = Rasterizer::new(small.clone()).unwrap();
-    let mut view = common::camera(rng, 64, 48);
+    let mut view = crate::common::camera(rng, 64, 48);
     let before = rasterizer.render(&map, &view, [0.0; 3]).unwrap();
     (view.pinhole.width, view.pinhole.height) = (4096, 4096);
     let refused = rasterizer.render(&map, &view, [0.0; 3]).unwrap_err();

@@ -1,8 +1,6 @@
 //! The oracle against central differences in f64: every parameter, the pose, the image loss. The smooth variant of the rasterizer is
 //! used, since its cut-offs are discontinuities.
 
-mod common;
-
 use fastrand::Rng;
 use keysplat::geometry::se3;
 use keysplat::splat::ShDegree;
@@ -26,7 +24,7 @@ fn difference(a: &[f64], b: &[f64]) -> f64 {
 }
 
 fn view(rng: &mut Rng) -> View64 {
-    View64 { camera: common::camera(rng, 12, 9), background: Vector3::new(0.2, 0.5, 0.1), cutoffs: Cutoffs::Smooth }
+    View64 { camera: crate::common::camera(rng, 12, 9), background: Vector3::new(0.2, 0.5, 0.1), cutoffs: Cutoffs::Smooth }
 }
 
 #[test]
@@ -34,10 +32,10 @@ fn parameter_gradients_are_central_differences() {
     for (seed, degree) in ShDegree::ALL.into_iter().enumerate() {
         let mut rng = Rng::with_seed(seed as u64);
         let view = view(&mut rng);
-        let cloud = cloud64(&common::scene(&mut rng, 6, degree));
-        let by_image = common::image_gradient(&mut rng, 12 * 9);
+        let cloud = cloud64(&crate::common::scene(&mut rng, 6, degree));
+        let by_image = crate::common::image_gradient(&mut rng, 12 * 9);
         let gradient = backward(&view, &cloud, &by_image);
-        let loss = |cloud: &[Gaussian64]| common::linear_loss(&render(&view, cloud), &by_image);
+        let loss = |cloud: &[Gaussian64]| crate::common::linear_loss(&render(&view, cloud), &by_image);
         let mut compared = 0.0;
         for i in 0..cloud.len() {
             let numeric: Vec<f64> = (0..cloud[i].flat().len())
@@ -68,8 +66,8 @@ fn pose_gradient_is_a_central_difference() {
     for seed in 0..8 {
         let mut rng = Rng::with_seed(100 + seed);
         let view = view(&mut rng);
-        let cloud = cloud64(&common::scene(&mut rng, 8, ShDegree::ALL[(seed % 4) as usize]));
-        let by_image = common::image_gradient(&mut rng, 12 * 9);
+        let cloud = cloud64(&crate::common::scene(&mut rng, 8, ShDegree::ALL[(seed % 4) as usize]));
+        let by_image = crate::common::image_gradient(&mut rng, 12 * 9);
         let gradient = backward(&view, &cloud, &by_image);
         let numeric: Vec<f64> = (0..6)
             .map(|k| {
@@ -78,12 +76,12 @@ fn pose_gradient_is_a_central_difference() {
                     let mut tau = Vector6::zeros();
                     tau[k] = by;
                     moved.camera.camera_from_world = se3::exp(&tau) * view.camera.camera_from_world;
-                    common::linear_loss(&render(&moved, &cloud), &by_image)
+                    crate::common::linear_loss(&render(&moved, &cloud), &by_image)
                 };
                 (shifted(STEP) - shifted(-STEP)) / (2.0 * STEP)
             })
             .collect();
-        let error = common::relative_error(gradient.pose.as_slice(), &numeric);
+        let error = crate::common::relative_error(gradient.pose.as_slice(), &numeric);
         assert!(error < TOLERANCE, "seed {seed}: {error:e}");
     }
 }
@@ -93,19 +91,19 @@ fn pose_gradient_is_a_central_difference() {
 fn clamped_jacobians_have_the_right_gradient() {
     let mut rng = Rng::with_seed(7);
     let view = view(&mut rng);
-    let mut cloud = cloud64(&common::scene(&mut rng, 4, ShDegree::default()));
+    let mut cloud = cloud64(&crate::common::scene(&mut rng, 4, ShDegree::default()));
     for (i, g) in cloud.iter_mut().enumerate() {
         g.mean.x = if i % 2 == 0 { 1.2 } else { -1.3 } * g.mean.z;
         g.log_scale = Vector3::new(-0.8, -1.0, -0.9);
     }
-    let by_image = common::image_gradient(&mut rng, 12 * 9);
+    let by_image = crate::common::image_gradient(&mut rng, 12 * 9);
     let gradient = backward(&view, &cloud, &by_image);
     for i in 0..cloud.len() {
         for k in 0..3 {
             let shifted = |by: f64| {
                 let mut moved = cloud.clone();
                 moved[i].mean[k] += by;
-                common::linear_loss(&render(&view, &moved), &by_image)
+                crate::common::linear_loss(&render(&view, &moved), &by_image)
             };
             let numeric = (shifted(STEP) - shifted(-STEP)) / (2.0 * STEP);
             let own = gradient.cloud[i].mean;

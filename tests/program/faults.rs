@@ -1,12 +1,10 @@
 //! What sensors and disks do in the middle of a run: it ends without panic or nonsense, says what is wrong, and keeps what was mapped.
 
-mod common;
-
 use std::ffi::OsStr;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
-use common::recording::{
+use crate::common::recording::{
     FPS, FRAMES, Finished, HEIGHT, WIDTH, color_file, copy_of_recording, finish, keysplat, metrics, run_command, scratch,
     skipped_without_adapter, stamp, stamps, truncate,
 };

@@ -1,6 +1,7 @@
 //! A little of `keysplat stress`: some cases of each family, none of which may fail. Those on the GPU say so loudly and pass where there is
 //! no adapter.
 
+use crate::common::requirements::skip;
 use keysplat::verification::stress::{self, CaseId, Machine, Part, StressConfig, StressReport};
 
 fn run(machine: Option<&Machine>, only: Part, cases: usize) -> StressReport {
@@ -13,13 +14,7 @@ fn run(machine: Option<&Machine>, only: Part, cases: usize) -> StressReport {
 }
 
 fn machine() -> Option<Machine> {
-    match Machine::open(None) {
-        Ok(machine) => Some(machine),
-        Err(error) => {
-            eprintln!("SKIPPED, the GPU was not stressed: {error}");
-            None
-        }
-    }
+    Machine::open(None).inspect_err(|error| skip("adapter", &error.to_string())).ok()
 }
 
 #[test]

@@ -1,7 +1,5 @@
 //! Steps that leave tiles out. Needs an adapter; says so loudly and passes where there is none.
 
-mod common;
-
 use fastrand::Rng;
 use glam::Vec3;
 use image::{Rgb, RgbImage};
@@ -47,14 +45,11 @@ impl Steps<'_> {
 
 #[test]
 fn a_tile_below_the_noise_is_left_out_and_the_others_learn_as_before() {
-    let Ok(gpu) = Gpu::open(None) else {
-        eprintln!("SKIPPED, steps that leave tiles out were not tried: no adapter");
-        return;
-    };
+    let Some(gpu) = crate::common::requirements::adapter() else { return };
     for form in BlendForm::ALL {
         let mut rng = Rng::with_seed(3);
-        let camera = common::camera(&mut rng, WIDTH, 64);
-        let mut cloud = common::scene(&mut rng, 150, ShDegree::ALL[1]);
+        let camera = crate::common::camera(&mut rng, WIDTH, 64);
+        let mut cloud = crate::common::scene(&mut rng, 150, ShDegree::ALL[1]);
         let in_camera = |mean: &Vec3| camera.camera_from_world * nalgebra::Point3::from(mean.to_array().map(f64::from));
         for i in 0..cloud.len() {
             // Five pixels across.
@@ -99,13 +94,10 @@ fn a_tile_below_the_noise_is_left_out_and_the_others_learn_as_before() {
 /// Drawn in proportion to their loss, tiles still all come up.
 #[test]
 fn every_tile_comes_up_now_and_then() {
-    let Ok(gpu) = Gpu::open(None) else {
-        eprintln!("SKIPPED, draws of tiles were not tried: no adapter");
-        return;
-    };
+    let Some(gpu) = crate::common::requirements::adapter() else { return };
     let mut rng = Rng::with_seed(4);
-    let camera = common::camera(&mut rng, WIDTH, 64);
-    let cloud = common::scene(&mut rng, 200, ShDegree::ALL[0]);
+    let camera = crate::common::camera(&mut rng, WIDTH, 64);
+    let cloud = crate::common::scene(&mut rng, 200, ShDegree::ALL[0]);
     let image = RgbImage::from_fn(WIDTH, 64, |x, _| Rgb([if x < WIDTH / 2 { 30 } else { rng.u8(..) }; 3]));
     let steps = Steps { gpu, form: BlendForm::Narrow, cloud: &cloud, camera, image: &image };
     let skip = TileSkip { share: 0.4, least: 0.1, noise: 0.0 };

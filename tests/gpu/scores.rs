@@ -1,10 +1,7 @@
 //! Scores of density control on the GPU against the f64 oracle. Needs an adapter; says so loudly and passes where there is none.
 
-mod common;
-
 use fastrand::Rng;
 use image::{Rgb, RgbImage};
-use keysplat::gpu::Gpu;
 use keysplat::optimise::{AdamConfig, LossConfig, Optimiser, TargetImage, TrainingView, WrongPixels};
 use keysplat::render::{BlendForm, GpuCloud, Rasterizer};
 use keysplat::splat::ShDegree;
@@ -17,16 +14,13 @@ const TOLERANCE: f64 = 1e-3;
 
 #[test]
 fn scores_are_those_of_their_definition() {
-    let Ok(gpu) = Gpu::open(None) else {
-        eprintln!("SKIPPED, scores were not compared with the oracle: no adapter");
-        return;
-    };
+    let Some(gpu) = crate::common::requirements::adapter() else { return };
     let (loss_config, wrong_config) =
         (LossConfig { depth_weight: 0.0, ..LossConfig::default() }, WrongPixels { error_ratio: 1.2, noise: 0.05 });
     for (seed, form) in (0..3).flat_map(|seed| BlendForm::ALL.map(|form| (seed, form))) {
         let mut rng = Rng::with_seed(40 + seed);
-        let camera = common::camera(&mut rng, 40, 24);
-        let cloud = common::scene(&mut rng, 40, ShDegree::ALL[0]);
+        let camera = crate::common::camera(&mut rng, 40, 24);
+        let cloud = crate::common::scene(&mut rng, 40, ShDegree::ALL[0]);
         let (width, height) = (camera.pinhole.width, camera.pinhole.height);
         let image = RgbImage::from_fn(width, height, |_, _| Rgb([rng.u8(..), rng.u8(..), rng.u8(..)]));
 
@@ -58,7 +52,7 @@ fn scores_are_those_of_their_definition() {
 
         let compare = |name: &str, found: Vec<f32>, expected: Vec<f64>| {
             let found: Vec<f64> = found.into_iter().map(f64::from).collect();
-            let error = common::relative_error(&found, &expected);
+            let error = crate::common::relative_error(&found, &expected);
             assert!(error < TOLERANCE, "{name}, seed {seed}, {form:?}: {error:e}");
         };
         compare("Σ w", found.iter().map(|s| s.weight_sum).collect(), expected.iter().map(|s| 2.0 * s.weight_sum).collect());

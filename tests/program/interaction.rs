@@ -1,8 +1,6 @@
 //! How the program talks and listens: standard output, standard error, Ctrl-C.
 
-mod common;
-
-use common::recording::{FRAMES, finish, keysplat, metrics, recording, run_command, scratch, skipped_without_adapter};
+use crate::common::recording::{FRAMES, finish, keysplat, metrics, recording, run_command, scratch, skipped_without_adapter};
 use keysplat::evaluation::Metrics;
 use serde_json::Value;
 
@@ -62,7 +60,7 @@ fn a_reader_that_goes_away_is_no_error() {
     // The pipe's reading end is closed before anything can be written.
     let mut child = keysplat(["adapters"]).spawn().unwrap();
     drop(child.stdout.take());
-    let said = common::recording::finish_child(child, String::new()).succeeded();
+    let said = crate::common::recording::finish_child(child, String::new()).succeeded();
     assert!(!said.stderr.contains("panicked"), "{}", said.stderr);
 }
 
@@ -72,7 +70,7 @@ mod interrupted {
     use std::process::{Child, Command};
     use std::time::Duration;
 
-    use common::recording::{finish_child, stamps, write_config};
+    use crate::common::recording::{finish_child, stamps, write_config};
     use keysplat::export::MapFormat;
 
     use super::*;

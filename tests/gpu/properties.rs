@@ -1,8 +1,6 @@
 //! Random scenes full of degenerate Gaussians: whatever goes in, images and gradients are finite, and right wherever rounding does not
 //! decide a cut-off.
 
-mod common;
-
 use std::sync::{Arc, Mutex, OnceLock};
 
 use fastrand::Rng;
@@ -33,24 +31,20 @@ struct Machine {
 
 /// One device for all cases; `None`, said once, without an adapter.
 fn machine() -> Option<&'static Mutex<Machine>> {
-    static MACHINE: OnceLock<Option<Mutex<Machine>>> = OnceLock::new();
-    MACHINE
-        .get_or_init(|| match Gpu::open(None) {
-            Ok(gpu) => {
-                let form = |&form| {
-                    let rasterizer = Rasterizer::with_form(gpu.clone(), form).unwrap();
-                    let optimiser = Optimiser::new(&rasterizer).unwrap();
-                    (rasterizer, optimiser)
-                };
-                let forms = BlendForm::ALL.iter().map(form).collect();
-                Some(Mutex::new(Machine { gpu, forms }))
-            }
-            Err(error) => {
-                eprintln!("SKIPPED, the GPU was not tried on degenerate scenes: {error}");
-                None
-            }
-        })
-        .as_ref()
+    static MACHINE: OnceLock<Result<Mutex<Machine>, String>> = OnceLock::new();
+    let machine = MACHINE.get_or_init(|| match Gpu::open(None) {
+        Ok(gpu) => {
+            let form = |&form| {
+                let rasterizer = Rasterizer::with_form(gpu.clone(), form).unwrap();
+                let optimiser = Optimiser::new(&rasterizer).unwrap();
+                (rasterizer, optimiser)
+            };
+            let forms = BlendForm::ALL.iter().map(form).collect();
+            Ok(Mutex::new(Machine { gpu, forms }))
+        }
+        Err(error) => Err(error.to_string()),
+    });
+    machine.as_ref().inspect_err(|error| crate::common::requirements::skip("adapter", error)).ok()
 }
 
 /// What is wrong with a Gaussian, with a strength in [0, 1].
@@ -78,9 +72,9 @@ fn faults() -> impl Strategy<Value = Vec<(u8, f32)>> {
 
 fn scene(seed: u64, faults: &[(u8, f32)]) -> (View64, GaussianCloud) {
     let mut rng = Rng::with_seed(seed);
-    let camera = common::camera(&mut rng, SIZE.0, SIZE.1);
+    let camera = crate::common::camera(&mut rng, SIZE.0, SIZE.1);
     let degree = ShDegree::ALL[(seed / 2 % 4) as usize];
-    let clean = common::scene(&mut rng, faults.len(), degree);
+    let clean = crate::common::scene(&mut rng, faults.len(), degree);
     let mut cloud = GaussianCloud::new(degree);
     for (i, (fault, strength)) in faults.iter().enumerate() {
         let mut gaussian = clean.get(i);
@@ -117,10 +111,10 @@ fn check(seed: u64, faults: &[(u8, f32)]) -> Result<(), TestCaseError> {
     prop_assert!(got.iter().all(|v| v.is_finite()), "the image is not finite");
     let wanted = expected.color.iter().zip(&expected.depth).flat_map(|(c, d)| [c.x, c.y, c.z, *d]);
     let wanted: Vec<f64> = wanted.chain(expected.transmittance.iter().copied()).collect();
-    let error = common::relative_error(&got, &wanted);
+    let error = crate::common::relative_error(&got, &wanted);
     prop_assert!(error < tolerance, "image: {error:e}, {judged:?}");
 
-    let by_image = common::image_gradient(&mut Rng::with_seed(seed), (SIZE.0 * SIZE.1) as usize);
+    let by_image = crate::common::image_gradient(&mut Rng::with_seed(seed), (SIZE.0 * SIZE.1) as usize);
     let by_color: Vec<[f32; 4]> = by_image
         .color
         .iter()
@@ -135,7 +129,7 @@ fn check(seed: u64, faults: &[(u8, f32)]) -> Result<(), TestCaseError> {
     let flat: Vec<f64> = cloud64(&got.cloud).iter().flat_map(Gaussian64::flat).collect();
     prop_assert!(flat.iter().all(|v| v.is_finite()) && got.pose.iter().all(|v| v.is_finite()), "a gradient is not finite");
     let expected: Vec<f64> = backward(&view, &wide, &by_image).cloud.iter().flat_map(Gaussian64::flat).collect();
-    let error = common::relative_error(&flat, &expected);
+    let error = crate::common::relative_error(&flat, &expected);
     prop_assert!(error < tolerance, "gradient: {error:e}, {judged:?}");
     Ok(())
 }

@@ -2,7 +2,6 @@
 
 use image::{Rgb, RgbImage};
 use keysplat::geometry::{Pinhole, Se3};
-use keysplat::gpu::Gpu;
 use keysplat::mapping::{DensityConfig, DensityStrategy, DepthSource, Keyframe, Mapper, MappingConfig};
 use keysplat::render::Rendered;
 use keysplat::sequence::{DepthImage, RectifiedImage};
@@ -31,13 +30,7 @@ fn difference(a: &Rendered, b: &Rendered) -> f32 {
 
 #[test]
 fn gaussians_follow_their_keyframe_when_it_moves_far() {
-    let gpu = match Gpu::open(None) {
-        Ok(gpu) => gpu,
-        Err(error) => {
-            eprintln!("SKIPPED, no map was moved: {error}");
-            return;
-        }
-    };
+    let Some(gpu) = crate::common::requirements::adapter() else { return };
     // Without control of density the Gaussians stay in the order of their keyframes.
     let density = DensityConfig { strategy: DensityStrategy::None, ..Default::default() };
     let config = MappingConfig { first_iterations: 20, iterations_per_keyframe: 5, density, ..Default::default() };

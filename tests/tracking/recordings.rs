@@ -1,7 +1,5 @@
 //! Tracking of whole frames: a ray-cast textured room with exact truth, and the start of a recording where there is one.
 
-use std::path::Path;
-
 use image::{Rgb, RgbImage};
 use keysplat::geometry::{Camera, Distortion, Pinhole, Se3, StampedPose, se3};
 use keysplat::sequence::{DepthImage, Frame, Sensor, Sequence};
@@ -310,11 +308,8 @@ fn unusable_input_is_refused_in_words() {
 
 #[test]
 fn the_start_of_redkitchen_is_tracked() {
-    let Some(data) = std::env::var_os("KEYSPLAT_DATA") else {
-        eprintln!("SKIPPED: set KEYSPLAT_DATA to the folder that holds redkitchen/");
-        return;
-    };
-    let sequence = Sequence::open(&Path::new(&data).join("redkitchen"), None, None).unwrap();
+    let Some(kitchen) = crate::common::requirements::recorded("redkitchen") else { return };
+    let sequence = Sequence::open(&kitchen, None, None).unwrap();
     let mut tracker = Tracker::new(sequence.camera, sequence.sensor, &TrackingConfig::default()).unwrap();
     for index in 0..60 {
         let tracked = tracker.track(&sequence.load(index).unwrap(), index % 8 != 7).unwrap();

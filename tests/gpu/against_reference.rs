@@ -1,8 +1,7 @@
 //! The GPU against the f64 oracle: images, gradients by every parameter and by the pose, the loss, Adam. Needs an adapter (the
 //! software one will do); says so loudly and passes where there is none.
 
-mod common;
-
+use crate::common::requirements::adapter;
 use fastrand::Rng;
 use image::RgbImage;
 use keysplat::geometry::Pinhole;
@@ -22,16 +21,6 @@ use std::sync::Arc;
 const IMAGE_TOLERANCE: f64 = 1e-4;
 const GRADIENT_TOLERANCE: f64 = 1e-3;
 const BACKGROUND: [f32; 3] = [0.2, 0.5, 0.1];
-
-fn gpu() -> Option<Arc<Gpu>> {
-    match Gpu::open(None) {
-        Ok(gpu) => Some(gpu),
-        Err(error) => {
-            eprintln!("SKIPPED, the GPU was not compared with the oracle: {error}");
-            None
-        }
-    }
-}
 
 fn view64(camera: &ViewCamera) -> View64 {
     let background = Vector3::from(BACKGROUND).map(f64::from);
@@ -65,7 +54,7 @@ fn compare_images(gpu: &Arc<Gpu>, cloud: &GaussianCloud, camera: &ViewCamera) ->
     for (mut rasterizer, _) in both_forms(gpu) {
         let rendered = rasterizer.render(&upload(gpu, cloud), camera, BACKGROUND).unwrap();
         let got: Vec<f64> = rendered.color_depth.iter().flatten().chain(&rendered.transmittance).map(|v| f64::from(*v)).collect();
-        let error = common::relative_error(&got, &wanted);
+        let error = crate::common::relative_error(&got, &wanted);
         assert!(error < IMAGE_TOLERANCE, "image, {:?}: {error:e}", rasterizer.form());
     }
     expected
@@ -74,7 +63,7 @@ fn compare_images(gpu: &Arc<Gpu>, cloud: &GaussianCloud, camera: &ViewCamera) ->
 /// Pushes the same image gradient back on both and compares.
 fn compare_gradients(gpu: &Arc<Gpu>, cloud: &GaussianCloud, camera: &ViewCamera, rng: &mut Rng) {
     let pixels = (camera.pinhole.width * camera.pinhole.height) as usize;
-    let by_image = common::image_gradient(rng, pixels);
+    let by_image = crate::common::image_gradient(rng, pixels);
     let narrow: Vec<[f32; 4]> =
         by_image.color.iter().zip(&by_image.depth).map(|(c, d)| [c.x as f32, c.y as f32, c.z as f32, *d as f32]).collect();
     let alpha: Vec<f32> = by_image.alpha.iter().map(|a| *a as f32).collect();
@@ -86,10 +75,10 @@ fn compare_gradients(gpu: &Arc<Gpu>, cloud: &GaussianCloud, camera: &ViewCamera,
             optimiser.gradients_from_image(&mut rasterizer, &upload(gpu, cloud), camera, BACKGROUND, (&narrow, &alpha)).unwrap();
         let got_flat = flat(&cloud64(&got.cloud));
         assert!(got_flat.iter().all(|v| v.is_finite()), "a gradient is not finite");
-        let error = common::relative_error(&got_flat, &wanted);
+        let error = crate::common::relative_error(&got_flat, &wanted);
         assert!(error < GRADIENT_TOLERANCE, "gradient, {form:?}: {error:e}");
         let pose: Vec<f64> = got.pose.iter().map(|v| f64::from(*v)).collect();
-        let error = common::relative_error(&pose, expected.pose.as_slice());
+        let error = crate::common::relative_error(&pose, expected.pose.as_slice());
         assert!(error < GRADIENT_TOLERANCE, "pose gradient, {form:?}: {error:e}");
         let dots = got_flat.iter().zip(&wanted).fold((0.0, 0.0, 0.0), |s, (x, y)| (s.0 + x * y, s.1 + x * x, s.2 + y * y));
         assert!(dots.0 / (dots.1 * dots.2).sqrt() > 1.0 - 1e-6, "gradient's direction, {form:?}");
@@ -98,11 +87,11 @@ fn compare_gradients(gpu: &Arc<Gpu>, cloud: &GaussianCloud, camera: &ViewCamera,
 
 #[test]
 fn random_scenes_agree() {
-    let Some(gpu) = gpu() else { return };
+    let Some(gpu) = adapter() else { return };
     for seed in 0..8 {
         let mut rng = Rng::with_seed(seed);
-        let camera = common::camera(&mut rng, 61, 45);
-        let cloud = common::scene(&mut rng, 300, ShDegree::ALL[(seed % 4) as usize]);
+        let camera = crate::common::camera(&mut rng, 61, 45);
+        let cloud = crate::common::scene(&mut rng, 300, ShDegree::ALL[(seed % 4) as usize]);
         compare_images(&gpu, &cloud, &camera);
         compare_gradients(&gpu, &cloud, &camera, &mut rng);
     }
@@ -112,7 +101,8 @@ fn random_scenes_agree() {
 fn target(rng: &mut Rng, pinhole: Pinhole) -> (RgbImage, Target64) {
     let (width, height) = (pinhole.width, pinhole.height);
     let color = RgbImage::from_fn(width, height, |_, _| image::Rgb([rng.u8(..), rng.u8(..), rng.u8(..)]));
-    let metres: Vec<f32> = (0..width * height).map(|i| if i % 4 == 0 { 0.0 } else { common::between(rng, 0.5, 3.0) }).collect();
+    let metres: Vec<f32> =
+        (0..width * height).map(|i| if i % 4 == 0 { 0.0 } else { crate::common::between(rng, 0.5, 3.0) }).collect();
     let wide = Target64 {
         width: width as usize,
         height: height as usize,
@@ -129,13 +119,13 @@ fn upload_target(gpu: &Gpu, image: &RgbImage, wide: &Target64) -> TargetImage {
 
 #[test]
 fn the_loss_and_its_whole_gradient_agree() {
-    let Some(gpu) = gpu() else { return };
+    let Some(gpu) = adapter() else { return };
     let config = LossConfig { ssim_weight: 0.2, depth_weight: 0.3, precise_depth_metres: 1.5 };
     for seed in 0..4 {
         let mut rng = Rng::with_seed(40 + seed);
         // Neither a multiple of the tile nor of the loss's block.
-        let camera = common::camera(&mut rng, 53, 37);
-        let cloud = common::scene(&mut rng, 200, ShDegree::ALL[(seed % 4) as usize]);
+        let camera = crate::common::camera(&mut rng, 53, 37);
+        let cloud = crate::common::scene(&mut rng, 200, ShDegree::ALL[(seed % 4) as usize]);
         let (image, wide) = target(&mut rng, camera.pinhole);
         let mut rasterizer = Rasterizer::new(gpu.clone()).unwrap();
         let mut optimiser = Optimiser::new(&rasterizer).unwrap();
@@ -153,10 +143,10 @@ fn the_loss_and_its_whole_gradient_agree() {
         let difference = (f64::from(got.loss.total(&config)) - value).abs();
         assert!(difference < 1e-4 * value, "loss {} against {value}", got.loss.total(&config));
         let expected = backward(&view, &cloud64(&cloud), &by_image);
-        let error = common::relative_error(&flat(&cloud64(&got.cloud)), &flat(&expected.cloud));
+        let error = crate::common::relative_error(&flat(&cloud64(&got.cloud)), &flat(&expected.cloud));
         assert!(error < GRADIENT_TOLERANCE, "gradient: {error:e}");
         let pose: Vec<f64> = got.pose.iter().map(|v| f64::from(*v)).collect();
-        let error = common::relative_error(&pose, expected.pose.as_slice());
+        let error = crate::common::relative_error(&pose, expected.pose.as_slice());
         assert!(error < GRADIENT_TOLERANCE, "pose gradient: {error:e}");
     }
 }
@@ -164,12 +154,12 @@ fn the_loss_and_its_whole_gradient_agree() {
 /// Steps of the fused kernel, and what they average to, against the oracle's Adam fed with the GPU's own gradients.
 #[test]
 fn adam_steps_agree() {
-    let Some(gpu) = gpu() else { return };
+    let Some(gpu) = adapter() else { return };
     let loss = LossConfig::default();
     let adam = AdamConfig { harmonics_every: 1, color_settling_steps: 2.0, averaged_steps: 1.5, ..AdamConfig::default() };
     let mut rng = Rng::with_seed(11);
-    let camera = common::camera(&mut rng, 48, 32);
-    let mut cloud = common::scene(&mut rng, 60, ShDegree::ALL[1]);
+    let camera = crate::common::camera(&mut rng, 48, 32);
+    let mut cloud = crate::common::scene(&mut rng, 60, ShDegree::ALL[1]);
     // One that cannot be seen: it must not move.
     cloud.means[5].z = -1.0;
     let (image, wide) = target(&mut rng, camera.pinhole);
@@ -205,7 +195,7 @@ fn adam_steps_agree() {
     let travel = |to: &[f64]| to.iter().zip(&start).map(|(a, b)| a - b).collect::<Vec<f64>>();
     let average = |(state, start): (&Adam64, Vec<f64>)| if state.steps > 0 { state.average.clone() } else { start };
     let averages: Vec<f64> = states.iter().zip(cloud64(&cloud).iter().map(Gaussian64::flat)).flat_map(average).collect();
-    let error = common::relative_error(&travel(&flat(&cloud64(&moved))), &travel(&averages));
+    let error = crate::common::relative_error(&travel(&flat(&cloud64(&moved))), &travel(&averages));
     assert!(error < 1e-3, "Adam: {error:e}");
     assert_eq!(moved.get(5), cloud.get(5), "an unseen Gaussian moved");
 }
@@ -213,7 +203,7 @@ fn adam_steps_agree() {
 /// The hazards of splatting, one Gaussian each, among ordinary ones: nothing may become NaN, and what is drawn must be right.
 #[test]
 fn hazards_stay_finite_and_right() {
-    let Some(gpu) = gpu() else { return };
+    let Some(gpu) = adapter() else { return };
     type Spoil = fn(&mut GaussianCloud, usize);
     let hazards: &[(&str, Spoil)] = &[
         ("on the near plane", |c, i| c.means[i] = glam::Vec3::new(0.0, 0.0, 0.05)),
@@ -235,8 +225,8 @@ fn hazards_stay_finite_and_right() {
     ];
     for (seed, (name, spoil)) in hazards.iter().enumerate() {
         let mut rng = Rng::with_seed(seed as u64);
-        let camera = common::camera(&mut rng, 40, 30);
-        let mut cloud = common::scene(&mut rng, 40, ShDegree::default());
+        let camera = crate::common::camera(&mut rng, 40, 30);
+        let mut cloud = crate::common::scene(&mut rng, 40, ShDegree::default());
         spoil(&mut cloud, 7);
         eprintln!("hazard: {name}");
         let expected = compare_images(&gpu, &cloud, &camera);
@@ -247,10 +237,10 @@ fn hazards_stay_finite_and_right() {
 
 #[test]
 fn non_finite_gaussians_are_refused_or_culled() {
-    let Some(gpu) = gpu() else { return };
+    let Some(gpu) = adapter() else { return };
     let mut rng = Rng::with_seed(1);
-    let camera = common::camera(&mut rng, 40, 30);
-    let clean = common::scene(&mut rng, 30, ShDegree::default());
+    let camera = crate::common::camera(&mut rng, 40, 30);
+    let clean = crate::common::scene(&mut rng, 30, ShDegree::default());
     let mut dirty = clean.clone();
     for value in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
         let mut bad = clean.get(0);
@@ -273,10 +263,10 @@ fn non_finite_gaussians_are_refused_or_culled() {
 
 #[test]
 fn depth_that_is_trusted_by_a_quarter_counts_as_if_it_had_a_quarter_of_the_weight() {
-    let Some(gpu) = gpu() else { return };
+    let Some(gpu) = adapter() else { return };
     let mut rng = Rng::with_seed(9);
-    let camera = common::camera(&mut rng, 64, 48);
-    let cloud = common::scene(&mut rng, 200, ShDegree::default());
+    let camera = crate::common::camera(&mut rng, 64, 48);
+    let cloud = crate::common::scene(&mut rng, 200, ShDegree::default());
     let (image, wide) = target(&mut rng, camera.pinhole);
     let image = upload_target(&gpu, &image, &wide);
     let learn = |depth_trust: f32, depth_weight: f32| {
@@ -296,10 +286,10 @@ fn depth_that_is_trusted_by_a_quarter_counts_as_if_it_had_a_quarter_of_the_weigh
 
 #[test]
 fn pairs_that_outgrow_their_buffers_are_never_dropped() {
-    let Some(gpu) = gpu() else { return };
+    let Some(gpu) = adapter() else { return };
     let mut rng = Rng::with_seed(5);
-    let camera = common::camera(&mut rng, 640, 480);
-    let mut cloud = common::scene(&mut rng, 400, ShDegree::default());
+    let camera = crate::common::camera(&mut rng, 640, 480);
+    let mut cloud = crate::common::scene(&mut rng, 400, ShDegree::default());
     cloud.log_scales.iter_mut().for_each(|s| *s = glam::Vec3::splat(-0.5));
     cloud.raw_opacities.iter_mut().for_each(|o| *o = -3.0);
     let mut rasterizer = Rasterizer::new(gpu.clone()).unwrap();

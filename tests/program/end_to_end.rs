@@ -1,13 +1,11 @@
 //! The real program from a recording to its outputs: what it writes, that the figures are true of what it wrote, that it repeats,
 //! and how it ends when it is interrupted or a frame cannot be read.
 
-mod common;
-
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
-use common::recording::{
+use crate::common::recording::{
     FIRST_ITERATIONS, FPS, FRAMES, HEIGHT, ITERATIONS_PER_KEYFRAME, WIDTH, change_line, color_file, copy_folder,
     copy_of_recording, finish, keysplat, metrics, recording, run_command, scratch, skipped_without_adapter, stamp, stamps,
     truncate,

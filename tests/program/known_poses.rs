@@ -1,10 +1,8 @@
 //! Mapping by known poses: of a recording with ground truth, and of photos with COLMAP's model in whatever unit its world has.
 
-mod common;
-
 use std::path::{Path, PathBuf};
 
-use common::recording::{
+use crate::common::recording::{
     FRAMES, copy_of_recording, finish, metrics, recording, run_command, scratch, skipped_without_adapter, stamps,
 };
 use keysplat::sequence::Sequence;

@@ -1,13 +1,12 @@
 //! What users get wrong: every mistake ends in an error that names the place and says what to do, and never in a panic.
 
-mod common;
-
 use std::path::{Path, PathBuf};
 
-use common::recording::{
+use crate::common::recording::{
     FRAMES, HEIGHT, WIDTH, change_line, color_file, copy_of_recording, finish, finish_child, keysplat, recording, run_command,
     scene, scratch, skipped_without_adapter, stamps, truncate,
 };
+use crate::common::requirements::skip;
 
 /// Spoils a copy of the recording, runs it, and checks that the error says `parts` and that no output was begun.
 fn refused(name: &str, spoil: impl FnOnce(&Path), more: &[&str], parts: &[&str]) {
@@ -41,7 +40,8 @@ fn folders_that_are_no_recordings() {
     finish(run_command(&file, &scratch().join("out"), &[])).refused(&[file.to_str().unwrap(), "give the folder"]);
     let spoil = |folder: &Path| remove(folder, "rgb.txt");
     refused("no-layout", spoil, &[], &["no-layout is no recording", "rgb.txt", "--layout"]);
-    finish(keysplat([Path::new("run"), Path::new("--out"), scratch()])).refused(&["which recording?", "keysplat run <SEQUENCE>"]);
+    finish(keysplat([Path::new("run"), Path::new("--out"), &scratch()]))
+        .refused(&["which recording?", "keysplat run <SEQUENCE>"]);
 }
 
 #[test]
@@ -279,7 +279,7 @@ fn a_full_disk() {
         return;
     }
     let Some(disk) = SmallDisk::mount("256k") else {
-        eprintln!("SKIPPED: mounting a small disk takes the rights of root");
+        skip("root", "mounting a small disk takes the rights of root");
         return;
     };
     let out = disk.0.path().join("out");
@@ -307,7 +307,7 @@ fn a_disk_that_fills_up_between_checkpoints() {
         return;
     }
     let Some(disk) = SmallDisk::mount("64m") else {
-        eprintln!("SKIPPED: mounting a small disk takes the rights of root");
+        skip("root", "mounting a small disk takes the rights of root");
         return;
     };
     let more = ["--set", "tracking.keyframe_translation=0.02", "--set", "mapping.iterations_per_keyframe=10"];

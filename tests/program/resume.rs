@@ -1,14 +1,12 @@
 //! Runs that were killed and go on from their checkpoint end as if nothing had happened, to the byte; what cannot go on says why.
 
-mod common;
-
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
-use common::pairs::stereo_recording;
-use common::recording::{
+use crate::common::pairs::stereo_recording;
+use crate::common::recording::{
     Finished, change_line, color_file, copy_folder, copy_of_recording, finish, keysplat, metrics, recording, run_command,
     scratch, skipped_without_adapter, truncate,
 };

@@ -1,13 +1,12 @@
 //! The report of a run as the program writes it, and as a browser shows it. The latter needs Chromium; says so loudly and passes
 //! where there is none.
 
-mod common;
-
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::OnceLock;
 
-use common::recording::{finish, keysplat, recording, run_command, scratch, skipped_without_adapter};
+use crate::common::recording::{finish, keysplat, recording, run_command, scratch, skipped_without_adapter};
+use crate::common::requirements::skip;
 
 /// A finished run with its report.
 fn report() -> &'static Path {
@@ -107,7 +106,7 @@ fn chromium_shows_it_on_a_phone_and_on_a_desk_by_day_and_by_night() {
     let Some(chromium) = ["chromium", "chromium-browser", "google-chrome"].into_iter().find(|name| {
         Command::new(name).arg("--version").stdout(Stdio::null()).stderr(Stdio::null()).status().is_ok_and(|s| s.success())
     }) else {
-        eprintln!("SKIPPED, the report was not looked at in a browser: no chromium");
+        skip("browser", "there is no chromium");
         return;
     };
     let page = scratch().join("probed.html");

@@ -1,11 +1,12 @@
 //! Real recordings in their layouts, skipped where `KEYSPLAT_DATA` names no folder with them; and a video through the whole program.
 
-mod common;
-
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use common::recording::{finish, keysplat, metrics, run_command, scene, scratch, skipped_without_adapter, stamps, truncate};
+use crate::common::recording::{
+    finish, keysplat, metrics, run_command, scene, scratch, skipped_without_adapter, stamps, truncate,
+};
+use crate::common::requirements::recorded;
 use image::RgbImage;
 use keysplat::config::Config;
 use keysplat::geometry::Se3;
@@ -14,15 +15,6 @@ use keysplat::synthetic::{self, CameraConfig, SceneConfig};
 use nalgebra::Point3;
 use opencv::core::{Mat, MatTraitConst, Size};
 use opencv::videoio::{VideoWriter, VideoWriterTrait};
-
-/// The recording's folder in `$KEYSPLAT_DATA`; says so where there is none.
-fn recorded(name: &str) -> Option<PathBuf> {
-    let folder = std::env::var_os("KEYSPLAT_DATA").map(|data| Path::new(&data).join(name));
-    if folder.is_none() {
-        eprintln!("SKIPPED: set KEYSPLAT_DATA to the folder that holds {name}/");
-    }
-    folder
-}
 
 /// Pixels in which only the nearest point is taken for visible.
 const CELL: f64 = 16.0;

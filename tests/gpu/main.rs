@@ -1,0 +1,17 @@
+//! The shaders and the mapper against the f64 oracle, and their behaviour at the limits.
+
+#[path = "../common/mod.rs"]
+mod common;
+
+mod against_reference;
+mod failures;
+mod long_optimisation;
+mod loop_moves_map;
+mod mapper;
+mod properties;
+mod reference_gradients;
+mod refined_poses;
+mod scores;
+mod shaders;
+mod skipped_tiles;
+mod stress;

@@ -1,0 +1,13 @@
+//! The whole program: runs, resumption, bad input, faults, reports.
+
+#[path = "../common/mod.rs"]
+mod common;
+
+mod bad_input;
+mod end_to_end;
+mod faults;
+mod interaction;
+mod known_poses;
+mod report;
+mod resume;
+mod sweep;
