@@ -55,7 +55,7 @@ pub struct ReplayConfig {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub frames: Option<(usize, usize)>,
     /// Frames arrive by their timestamps; what comes too late is counted. Otherwise nothing is dropped and a run repeats to the bit.
-    pub paced: bool,
+    pub real_time: bool,
     /// Nothing is tracked: poses are those that the recording knows (COLMAP, transforms.json, ground truth).
     pub known_poses: bool,
     /// Every n-th frame is never given to the mapper and measures the map; 0 holds none out.
@@ -78,7 +78,7 @@ impl Default for Config {
 
 impl Default for ReplayConfig {
     fn default() -> Self {
-        Self { every: 1, frames: None, paced: false, known_poses: false, held_out_every: 8 }
+        Self { every: 1, frames: None, real_time: false, known_poses: false, held_out_every: 8 }
     }
 }
 
@@ -97,8 +97,38 @@ pub enum ConfigError {
     Syntax { path: PathBuf, source: Box<toml::de::Error> },
     #[error("{0}")]
     Value(String),
+    /// A key of an earlier version.
+    #[error("`{old}` is called `{new}` now")]
+    Renamed {
+        /// Dotted key as found.
+        old: &'static str,
+        /// Dotted key that replaced it.
+        new: &'static str,
+    },
+    /// An error in a file.
     #[error("{path}: {source}")]
     In { path: PathBuf, source: Box<ConfigError> },
+}
+
+/// Dotted keys of earlier versions, and those that replaced them.
+const RENAMED: [(&str, &str); 1] = [("replay.paced", "replay.real_time")];
+
+/// Refuses keys of earlier versions by their new names.
+fn check_renamed(table: &toml::Table) -> Result<(), ConfigError> {
+    let contains = |key: &str| {
+        let mut parts = key.split('.').peekable();
+        let mut inner = table;
+        while let Some(part) = parts.next() {
+            match (inner.get(part), parts.peek()) {
+                (Some(_), None) => return true,
+                (Some(toml::Value::Table(next)), Some(_)) => inner = next,
+                _ => return false,
+            }
+        }
+        false
+    };
+    let found = RENAMED.iter().find(|(old, _)| contains(old));
+    found.map_or(Ok(()), |(old, new)| Err(ConfigError::Renamed { old, new }))
 }
 
 /// Puts the values of `over` in the place of those of `under`, table by table.
@@ -141,6 +171,8 @@ impl Config {
     /// The same of a text; `path` is named in errors.
     pub fn parse(text: &str, path: &Path, known_poses: bool) -> Result<Self, ConfigError> {
         let syntax = |source| ConfigError::Syntax { path: path.into(), source: Box::new(source) };
+        let in_file = |source| ConfigError::In { path: path.into(), source: Box::new(source) };
+        check_renamed(&toml::from_str(text).map_err(syntax)?).map_err(in_file)?;
         let mut config: Self = toml::from_str(text).map_err(syntax)?;
         if known_poses || config.replay.known_poses {
             let mut table = toml::Table::try_from(Self::offline()).expect("a configuration is plain data");
@@ -148,7 +180,7 @@ impl Config {
             config = table.try_into().map_err(syntax)?;
             config.replay.known_poses = true;
         }
-        config.validate().map_err(|source| ConfigError::In { path: path.into(), source: Box::new(source) })?;
+        config.validate().map_err(in_file)?;
         Ok(config)
     }
 
@@ -164,6 +196,9 @@ impl Config {
             let (key, value) = setting.split_once('=').ok_or_else(|| wrong("write key=value, like mapping.seed=1"))?;
             let value = toml::from_str::<toml::Table>(&format!("v = {value}")).ok().and_then(|mut t| t.remove("v"));
             let value = value.unwrap_or_else(|| toml::Value::String(setting[key.len() + 1..].into()));
+            if let Some((old, new)) = RENAMED.iter().find(|(old, _)| key.trim() == *old) {
+                return Err(ConfigError::Renamed { old, new });
+            }
             let mut parts: Vec<&str> = key.trim().split('.').collect();
             let last = parts.pop().unwrap_or_default();
             let mut inner = &mut table;
@@ -191,10 +226,10 @@ impl Config {
         if self.checkpoint_every == Some(0) {
             return value("checkpoint_every must be at least 1".into());
         }
-        if self.checkpoint_every.is_some() && (self.replay.paced || self.mapping.yields_to_keyframes) {
+        if self.checkpoint_every.is_some() && (self.replay.real_time || self.mapping.yields_to_keyframes) {
             return value(
-                "a run against the clock does not repeat and cannot be resumed: leave --checkpoint-every out, or --paced and \
-                 --budget realtime (replay.paced, mapping.yields_to_keyframes)"
+                "a run against the clock does not repeat and cannot be resumed: leave --checkpoint-every out, or --real-time and \
+                 --preset realtime (replay.real_time, mapping.yields_to_keyframes)"
                     .into(),
             );
         }
@@ -239,6 +274,24 @@ mod tests {
         assert!(wrong("map_scale = 2.0").contains("map_scale"));
         assert!(wrong("[mapping.seeding]\nstride = 0").contains("stride"));
         assert!(wrong("[mapping.adam]\nbeta_1 = 1.0").contains("beta_1"));
+    }
+
+    #[test]
+    fn keys_of_earlier_versions_are_refused_by_their_new_names() {
+        for (old, new) in RENAMED {
+            let setting = format!("{old}=1");
+            let (section, key) = old.rsplit_once('.').unwrap();
+            let in_file = Config::parse(&format!("[{section}]\n{key} = 1\n"), Path::new("run.toml"), false).unwrap_err();
+            let said = Config::default().with_settings(&[setting]).unwrap_err().to_string();
+            for message in [in_file.to_string(), said] {
+                assert!(message.contains(old) && message.contains(new), "{message}");
+            }
+            let mut table = toml::Table::try_from(Config::default()).unwrap();
+            for part in new.split('.') {
+                let next = table.get(part).unwrap_or_else(|| panic!("there is no {new}")).clone();
+                table = next.as_table().cloned().unwrap_or_default();
+            }
+        }
     }
 
     #[test]

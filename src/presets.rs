@@ -32,7 +32,7 @@ impl Preset {
         let mapping = &mut config.mapping;
         match self {
             Self::Realtime => {
-                config.replay.paced = true;
+                config.replay.real_time = true;
                 mapping.yields_to_keyframes = true;
                 mapping.first_iterations = 10;
                 mapping.iterations_per_keyframe = 200;
@@ -89,4 +89,26 @@ pub fn realtime_scale(gpu: &Arc<Gpu>, recording: &Recording) -> Result<f64, GpuE
         }
     }
     Ok(chosen)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn presets_are_valid_and_differ() {
+        let of = |preset: Preset| {
+            let mut config = Config::default();
+            preset.apply(&mut config);
+            config.validate().unwrap();
+            config
+        };
+        assert_eq!(of(Preset::Balanced), Config::default());
+        let (realtime, quality) = (of(Preset::Realtime), of(Preset::Quality));
+        assert!(realtime.replay.real_time && realtime.mapping.yields_to_keyframes);
+        assert!(
+            !quality.replay.real_time
+                && quality.mapping.iterations_per_keyframe > Config::default().mapping.iterations_per_keyframe
+        );
+    }
 }

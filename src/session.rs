@@ -67,7 +67,7 @@ pub enum SessionError {
     #[error(transparent)]
     Trajectory(#[from] TrajectoryError),
     /// A file of a run's folder is missing.
-    #[error("there is no {path}; {advice}")]
+    #[error("there is no file {path}; {advice}")]
     Missing {
         /// The file.
         path: PathBuf,
@@ -75,12 +75,28 @@ pub enum SessionError {
         advice: &'static str,
     },
     /// A file of a run's folder cannot be read or does not parse.
-    #[error("{path} cannot be used: {reason}")]
+    #[error("{path} {reason}")]
     Unreadable {
         /// The file.
         path: PathBuf,
         /// The cause, and what to do about it.
         reason: String,
+    },
+    /// A folder to evaluate that does not name its recording.
+    #[error("{folder} has no config.toml that names its recording; name it with --sequence")]
+    UnnamedRecording {
+        /// The folder.
+        folder: PathBuf,
+    },
+    /// A trajectory that belongs to another recording.
+    #[error("no pose of {trajectory} is within {seconds} s of a frame of {recording}; name the right recording with --sequence")]
+    NoPoseNearFrames {
+        /// Its file.
+        trajectory: PathBuf,
+        /// Largest difference of timestamps, seconds.
+        seconds: f64,
+        /// Name of the recording.
+        recording: String,
     },
     /// A resumed run's recording has moved.
     #[error("the recording is no longer at {path}; name its new place with --sequence")]

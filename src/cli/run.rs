@@ -43,8 +43,8 @@ pub struct RunArgs {
     #[arg(long, value_name = "A..B", value_parser = parse_range)]
     frames: Option<(usize, usize)>,
     /// Let frames arrive by their timestamps and drop what comes too late.
-    #[arg(long)]
-    paced: bool,
+    #[arg(long, alias = "paced")]
+    real_time: bool,
     /// Track nothing: take the poses that the recording knows (COLMAP, transforms.json, ground truth), and refine the map over all
     /// keyframes after the last one.
     #[arg(long)]
@@ -125,7 +125,7 @@ impl RunArgs {
         config.map_scale = self.map_scale.unwrap_or(config.map_scale);
         config.replay.every = self.every.unwrap_or(config.replay.every);
         config.replay.frames = self.frames.or(config.replay.frames);
-        config.replay.paced |= self.paced;
+        config.replay.real_time |= self.real_time;
         config.adapter = self.adapter.clone().or(config.adapter);
         config.checkpoint_every = self.checkpoint_every.or(config.checkpoint_every);
         config.mapping.limits.max_gaussians = self.max_gaussians.or(config.mapping.limits.max_gaussians);

@@ -148,7 +148,7 @@ pub(super) fn follow(thread: &TrackThread<'_>) -> TrackSummary {
     let TrackThread { recording, frames, mapper, progress } = *thread;
     let (sequence, config) = (recording.sequence(), recording.config());
     let mut summary = TrackSummary::default();
-    let mut sender = KeyframeSender::new(mapper, config.replay.paced);
+    let mut sender = KeyframeSender::new(mapper, config.replay.real_time);
     let rectifier = Rectifier::new(&sequence.camera, config.map_scale);
     let scene_distance = scene_distance(recording).unwrap_or(USUAL_DISTANCE_METRES);
     let mut follower = Follower { recording, rectifier, keyframes: Vec::new(), scene_distance };

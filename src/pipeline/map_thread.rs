@@ -290,3 +290,39 @@ impl MapSummary {
         progress.mapping.force_push(MapSnapshot { cloud, keyframes: self.keyframes.len(), psnr_db });
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use crossbeam::channel::unbounded;
+    use image::RgbImage;
+
+    use super::*;
+    use crate::geometry::{Pinhole, Se3};
+    use crate::mapping::{DepthSource, Keyframe};
+    use crate::sequence::RectifiedImage;
+
+    fn keyframe() -> MapperMessage {
+        let pinhole = Pinhole { fx: 8.0, fy: 8.0, cx: 3.5, cy: 3.5, width: 8, height: 8 };
+        let image = RectifiedImage { pinhole, color: RgbImage::new(8, 8), depth: None };
+        let world_from_camera = Se3::identity();
+        let keyframe = Keyframe { id: 0, world_from_camera, image, depth_source: DepthSource::Sensor, covisible: Vec::new() };
+        MapperMessage::Keyframe(Box::new(keyframe))
+    }
+
+    /// Real time: the steps of a keyframe end when the next one waits, and pose updates before it are not lost.
+    #[test]
+    fn a_keyframe_that_waits_is_seen_behind_pose_updates() {
+        let (sender, messages) = unbounded();
+        let inbox = Inbox { messages: &messages, ahead: RefCell::default() };
+        assert!(!inbox.keyframe_waits());
+        sender.send(MapperMessage::PoseUpdate(Vec::new())).unwrap();
+        assert!(!inbox.keyframe_waits());
+        sender.send(keyframe()).unwrap();
+        assert!(inbox.keyframe_waits() && inbox.waiting() == 2);
+        assert!(matches!(inbox.next(), Some(MapperMessage::PoseUpdate(_))));
+        assert!(matches!(inbox.next(), Some(MapperMessage::Keyframe(_))));
+        assert!(!inbox.keyframe_waits());
+        drop(sender);
+        assert!(inbox.keyframe_waits() && inbox.next().is_none());
+    }
+}

@@ -44,7 +44,7 @@ pub(super) fn channel(config: &Config) -> (PoseFeedbackSender, PoseFeedbackRecei
     let (sender, reports) = bounded(LAG + 1);
     (
         PoseFeedbackSender(Some(sender)),
-        PoseFeedbackReceiver { reports: Some(reports), paced: config.replay.paced, awaited: VecDeque::new() },
+        PoseFeedbackReceiver { reports: Some(reports), paced: config.replay.real_time, awaited: VecDeque::new() },
     )
 }
 
@@ -103,7 +103,7 @@ mod tests {
     fn config(paced: bool) -> Config {
         let mut config = Config::default();
         config.mapping.refine_poses.enabled = true;
-        config.replay.paced = paced;
+        config.replay.real_time = paced;
         config
     }
 

@@ -48,3 +48,46 @@ pub(super) fn read(sequence: &Sequence, paced: bool, sender: &Sender<Frame>, pro
     }
     summary
 }
+
+#[cfg(test)]
+mod tests {
+    use crossbeam::channel::bounded;
+
+    use super::*;
+    use crate::synthetic::{self, CameraConfig, SceneConfig};
+
+    const FRAMES: usize = 5;
+    const CAPACITY: usize = 2;
+
+    /// A tiny recording of a hundred frames per second, in a folder that goes with it.
+    fn sequence() -> (tempfile::TempDir, Sequence) {
+        let folder = tempfile::tempdir().unwrap();
+        let camera = CameraConfig { width: 32, height: 24, fx: 26.0, fy: 26.0, cx: 15.5, cy: 11.5, ..CameraConfig::default() };
+        let scene = SceneConfig { frames: FRAMES, fps: 100.0, camera, ..SceneConfig::default() };
+        synthetic::generate(&scene, folder.path(), &|_, _| {}).unwrap();
+        let sequence = Sequence::open(folder.path(), None, None).unwrap();
+        (folder, sequence)
+    }
+
+    #[test]
+    fn in_real_time_frames_that_find_the_channel_full_are_dropped_and_counted() {
+        let (_folder, sequence) = sequence();
+        let (sender, frames) = bounded(CAPACITY);
+        let summary = read(&sequence, true, &sender, &Progress::default());
+        assert_eq!((summary.late, summary.read_failed), (FRAMES - CAPACITY, 0));
+        assert_eq!(frames.try_iter().map(|frame| frame.index).collect::<Vec<_>>(), [0, 1]);
+    }
+
+    #[test]
+    fn deterministic_replay_drops_nothing() {
+        let (_folder, sequence) = sequence();
+        let (sender, frames) = bounded(CAPACITY);
+        let (summary, read) = std::thread::scope(|scope| {
+            let consumer = scope.spawn(|| frames.iter().count());
+            let summary = read(&sequence, false, &sender, &Progress::default());
+            drop(sender);
+            (summary, consumer.join().unwrap())
+        });
+        assert_eq!((summary.late, read), (0, FRAMES));
+    }
+}

@@ -46,7 +46,7 @@ pub fn run(
     let started = Instant::now();
     let mut elapsed = checkpointer.as_ref().map_or_else(Elapsed::default, Checkpointer::earlier);
     let config = recording.config();
-    let paced = config.replay.paced;
+    let paced = config.replay.real_time;
     let (frame_sender, frames) = bounded(FRAMES_AHEAD);
     let waiting = paced.then(|| frames.clone());
     let (message_sender, messages) = bounded(MESSAGES_AHEAD);

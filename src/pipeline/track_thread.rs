@@ -88,11 +88,11 @@ impl TrackThread<'_> {
         let (sequence, config) = (self.recording.sequence(), self.recording.config());
         let mut summary = TrackSummary::default();
         let mut tracker = match Tracker::new(sequence.camera, sequence.sensor, &config.tracking) {
-            Ok(tracker) => tracker.paced(config.replay.paced),
+            Ok(tracker) => tracker.paced(config.replay.real_time),
             Err(error) => return TrackSummary { error: Some(error.into()), ..summary },
         };
         let rectifier = Rectifier::new(&sequence.camera, config.map_scale);
-        let mut keyframes = KeyframeSender::new(self.mapper, config.replay.paced);
+        let mut keyframes = KeyframeSender::new(self.mapper, config.replay.real_time);
         for frame in self.frames {
             let may_be_keyframe = !config.replay.is_held_out(frame.index);
             let tracked = match guarded("tracking", || Ok(tracker.track(&frame, may_be_keyframe)?)) {

@@ -305,7 +305,7 @@ pub fn write_metrics(
     let metrics = Metrics {
         sequence: sequence.name.clone(),
         sensor: sequence.sensor.kind(),
-        paced: config.replay.paced,
+        paced: config.replay.real_time,
         frames,
         frames_read_failed: result.frames_read_failed as u64,
         frames_tracked: result.poses.len() as u64,

@@ -47,14 +47,11 @@ pub fn evaluate_folder(folder: &Path, options: &EvaluateOptions, on_view: &dyn F
     let keyframes = if keyframes_file.is_file() { read_trajectory(&keyframes_file)? } else { Trajectory::default() };
     let map_file = folder.join(outputs::MAP);
     let cloud = MapFormat::Ply.read(&map_file).map_err(OutputError::from)?;
-    let map_bytes = std::fs::read(&map_file).map_err(|error| unreadable(&map_file, &error))?;
+    let map_bytes = std::fs::read(&map_file).map_err(|error| unreadable(&map_file, format!("cannot be read: {error}")))?;
     let poses = nearest_frames(sequence, &trajectory);
     if poses.is_empty() {
-        let reason = format!(
-            "no pose is within {MAX_TIME_DIFFERENCE_S} s of a frame of {}; name the right recording with --sequence",
-            sequence.name
-        );
-        return Err(SessionError::Unreadable { path: folder.join(outputs::TRAJECTORY), reason });
+        let (trajectory, recording) = (folder.join(outputs::TRAJECTORY), sequence.name.clone());
+        return Err(SessionError::NoPoseNearFrames { trajectory, seconds: MAX_TIME_DIFFERENCE_S, recording });
     }
     let gpu = Gpu::open(recording.config().adapter.as_deref())?;
     let _lock = outputs::prepare_folder(folder)?;
@@ -85,13 +82,13 @@ fn resolve(folder: &Path, options: &EvaluateOptions) -> Result<Config, SessionEr
     config.map_scale = options.map_scale.unwrap_or(config.map_scale);
     config.adapter = options.adapter.clone().or(config.adapter);
     if config.sequence.is_none() {
-        return Err(SessionError::Missing { path: own, advice: "no recording is named; name it with --sequence" });
+        return Err(SessionError::UnnamedRecording { folder: folder.into() });
     }
     Ok(config)
 }
 
-fn unreadable(path: &Path, reason: &dyn std::fmt::Display) -> SessionError {
-    SessionError::Unreadable { path: path.into(), reason: reason.to_string() }
+fn unreadable(path: &Path, reason: impl Into<String>) -> SessionError {
+    SessionError::Unreadable { path: path.into(), reason: reason.into() }
 }
 
 fn read_trajectory(path: &Path) -> Result<Trajectory, SessionError> {
@@ -118,9 +115,9 @@ fn exposures(folder: &Path) -> Result<Exposures, SessionError> {
     if !path.is_file() {
         return Ok(Exposures::default());
     }
-    let text = std::fs::read_to_string(&path).map_err(|error| unreadable(&path, &error))?;
-    let advice = "it does not hold exposures; move it away to compare with the map's own colours";
-    Exposures::parse(&text).ok_or_else(|| unreadable(&path, &advice))
+    let text = std::fs::read_to_string(&path).map_err(|error| unreadable(&path, format!("cannot be read: {error}")))?;
+    let advice = "does not hold exposures; move it away to compare with the map's own colours";
+    Exposures::parse(&text).ok_or_else(|| unreadable(&path, advice))
 }
 
 fn earlier_metrics(folder: &Path) -> Result<Option<Metrics>, SessionError> {
@@ -128,11 +125,9 @@ fn earlier_metrics(folder: &Path) -> Result<Option<Metrics>, SessionError> {
     if !path.is_file() {
         return Ok(None);
     }
-    let text = std::fs::read_to_string(&path).map_err(|error| unreadable(&path, &error))?;
+    let text = std::fs::read_to_string(&path).map_err(|error| unreadable(&path, format!("cannot be read: {error}")))?;
     let advice = "move it away to have it written anew";
-    serde_json::from_str(&text)
-        .map(Some)
-        .map_err(|error| unreadable(&path, &format!("it is not this version's ({error}); {advice}")))
+    serde_json::from_str(&text).map(Some).map_err(|error| unreadable(&path, format!("is not this version's ({error}); {advice}")))
 }
 
 /// Metrics of another system's run: figures that the folder does not provide stay empty.
@@ -141,7 +136,7 @@ fn foreign_metrics(recording: &Recording) -> Metrics {
     Metrics {
         sequence: sequence.name.clone(),
         sensor: sequence.sensor.kind(),
-        paced: recording.config().replay.paced,
+        paced: recording.config().replay.real_time,
         frames: sequence.entries.len() as u64,
         frames_read_failed: 0,
         frames_tracked: 0,

@@ -248,7 +248,7 @@ fn a_paced_run_counts_what_came_too_late() {
         std::fs::write(hasty.join(list), faster.collect::<String>()).unwrap();
     }
     truncate(&color_file(&hasty, 2), 500);
-    let out = run("paced", &hasty, &["--paced"]);
+    let out = run("paced", &hasty, &["--real-time"]);
     let m = metrics(&out);
     assert!(m.paced);
     assert_eq!((m.frames, m.frames_read_failed), (FRAMES as u64, 1));
@@ -256,6 +256,25 @@ fn a_paced_run_counts_what_came_too_late() {
     // What remains was given to the tracker and lost.
     let lost = m.frames.checked_sub(m.frames_tracked + m.frames_late + m.frames_read_failed);
     assert!(m.frames_tracked >= 1 && lost.is_some(), "{m:?}");
+}
+
+/// The preset measures a resolution that the adapter can afford, replays by timestamps, and maps as long as there is time.
+#[test]
+fn the_realtime_preset_maps_at_a_resolution_that_was_measured() {
+    if skipped_without_adapter() {
+        return;
+    }
+    let out = scratch().join("realtime");
+    let mut command = keysplat(["run", "--preset", "realtime"]);
+    command.arg(recording()).arg("--out").arg(&out);
+    let said = finish(command).succeeded();
+    assert!(said.stderr.contains("training step measured"), "{}", said.stderr);
+    let (m, config) = (metrics(&out), Config::read(&out.join("config.toml")).unwrap());
+    let mapping = m.mapping.clone().unwrap();
+    assert!(m.paced && config.mapping.yields_to_keyframes && mapping.iterations > 0, "{m}");
+    assert_eq!(mapping.map_width, (f64::from(WIDTH) * config.map_scale).round() as u32);
+    // Frames last as long as they did when they were recorded.
+    assert!(m.wall_s.unwrap() >= (FRAMES - 1) as f64 / FPS, "{m}");
 }
 
 #[test]

@@ -8,6 +8,7 @@ mod end_to_end;
 mod faults;
 mod interaction;
 mod known_poses;
+mod quality;
 mod report;
 mod resume;
 mod sweep;

@@ -1,5 +1,6 @@
 //! Runs that were killed and go on from their checkpoint end as if nothing had happened, to the byte; what cannot go on says why.
 
+use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::OnceLock;
@@ -58,10 +59,20 @@ fn started(mut command: Command, out: &Path, count: usize) -> Child {
     child
 }
 
-/// Kills a command once `count` further checkpoints have been seen, and then some milliseconds later.
-fn killed(command: Command, out: &Path, (count, later_ms): (usize, u64)) {
-    let mut child = started(command, out, count);
-    std::thread::sleep(Duration::from_millis(later_ms));
+/// Kills a command once `count` further checkpoints have been seen.
+fn killed(command: Command, out: &Path, count: usize) {
+    kill(started(command, out, count), out);
+}
+
+/// Kills a resumed run when it begins to replay what came before its checkpoint.
+fn killed_while_catching_up(mut command: Command, out: &Path) {
+    let mut child = command.stdout(Stdio::null()).spawn().unwrap();
+    let mut log = BufReader::new(child.stderr.take().unwrap()).lines();
+    assert!(log.any(|line| line.unwrap().contains("replaying into")), "it ended before it was killed");
+    kill(child, out);
+}
+
+fn kill(mut child: Child, out: &Path) {
     child.kill().unwrap();
     assert!(!child.wait().unwrap().success(), "it ended before it was killed");
     assert!(checkpoint(out).exists());
@@ -103,11 +114,11 @@ fn assert_same_run(a: &Path, b: &Path) {
 fn survives(name: &str, recording: &Path, more: &[&str], checkpoints: usize) {
     let whole = unbroken(&format!("{name}-whole"), recording, more);
     let out = scratch().join(name);
-    killed(keeping(recording, &out, more), &out, (checkpoints, 20));
-    killed(resume(&out), &out, (0, 400));
-    killed(resume(&out), &out, (2, 0));
+    killed(keeping(recording, &out, more), &out, checkpoints);
+    killed_while_catching_up(resume(&out), &out);
+    killed(resume(&out), &out, 2);
     let said = finish(resume(&out)).succeeded();
-    assert!(said.stderr.contains("caught up with the checkpoint"), "{}", said.stderr);
+    assert!(said.stderr.contains("checkpoint reached"), "{}", said.stderr);
     assert_same_run(&out, &whole);
     // The second part may not have come to a checkpoint.
     let resumed = metrics(&out).resumed;
@@ -157,7 +168,7 @@ fn a_refinement_goes_on_where_it_stood() {
     let keyframes = metrics(&whole).keyframes.unwrap() as usize;
     let out = scratch().join("refined");
     // The first checkpoint comes before any keyframe, and a round follows them.
-    killed(keeping(recording(), &out, &refine), &out, (keyframes + 2, 0));
+    killed(keeping(recording(), &out, &refine), &out, keyframes + 2);
     finish(resume(&out)).succeeded();
     assert_same_run(&out, &whole);
     assert_eq!(metrics(&out).resumed, 1);
@@ -189,7 +200,7 @@ fn interrupted() -> &'static Path {
     static OUT: OnceLock<PathBuf> = OnceLock::new();
     OUT.get_or_init(|| {
         let (copy, out) = (copy_of_recording("theirs"), scratch().join("interrupted"));
-        killed(keeping(&copy, &out, &[]), &out, (4, 0));
+        killed(keeping(&copy, &out, &[]), &out, 4);
         out
     })
 }
@@ -256,7 +267,7 @@ fn a_recording_that_moved_is_named_anew() {
     }
     let (there, elsewhere) = (copy_of_recording("there"), scratch().join("elsewhere"));
     let out = scratch().join("moved");
-    killed(keeping(&there, &out, &[]), &out, (3, 0));
+    killed(keeping(&there, &out, &[]), &out, 3);
     std::fs::rename(&there, &elsewhere).unwrap();
     finish(resume(&out)).refused(&["no longer at", there.to_str().unwrap(), "--sequence"]);
     let resume_with = |recording: &Path| {
@@ -266,7 +277,7 @@ fn a_recording_that_moved_is_named_anew() {
     };
     finish(resume_with(stereo_recording())).refused(&["checkpoint.bin is of another run", "camera or times"]);
     // It stays where it was named, for the part after this one too.
-    killed(resume_with(Path::new("elsewhere")), &out, (2, 0));
+    killed(resume_with(Path::new("elsewhere")), &out, 2);
     finish(resume(&out)).succeeded();
     assert_same_run(&out, &unbroken("moved-whole", recording(), &[]));
 }
@@ -305,8 +316,8 @@ fn what_is_finished_or_was_never_begun_says_so() {
 #[test]
 fn runs_that_do_not_repeat_keep_no_checkpoints() {
     let out = scratch().join("never");
-    for more in [&["--paced"][..], &["--budget", "realtime"], &["--set", "mapping.yields_to_keyframes=true"]] {
-        finish(keeping(recording(), &out, more)).refused(&["cannot be resumed", "--checkpoint-every", "--paced"]);
+    for more in [&["--real-time"][..], &["--preset", "realtime"], &["--set", "mapping.yields_to_keyframes=true"]] {
+        finish(keeping(recording(), &out, more)).refused(&["cannot be resumed", "--checkpoint-every", "--real-time"]);
     }
     finish(run_command(recording(), &out, &["--checkpoint-every", "0"])).refused(&["checkpoint_every must be at least 1"]);
     assert!(!out.exists());

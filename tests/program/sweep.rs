@@ -54,22 +54,22 @@ fn a_sweep_is_made_once_and_compared() {
 }
 
 #[test]
-fn budgets_are_swept_with_their_own_steps_or_with_all() {
+fn presets_are_swept_with_their_own_steps_or_with_all() {
     if skipped_without_adapter() {
         return;
     }
-    let out = scratch().join("budgets");
+    let out = scratch().join("presets");
     let csv_of = |points: &[&str]| {
         sweep(&out, points).succeeded();
         std::fs::read_to_string(out.join("sweep.csv")).unwrap()
     };
-    let own = csv_of(&["--budgets", "balanced,quality"]);
+    let own = csv_of(&["--presets", "balanced,quality"]);
     assert!(own.contains("\"recording\",\"balanced\",0,24,24,") && own.contains("\"quality\",0,"), "{own}");
     let settings = |run: &str| Config::read(&out.join("runs/recording").join(run).join("config.toml")).unwrap().mapping;
     let (usual, quality) = (MappingConfig::default(), settings("quality-0"));
     assert_eq!(settings("balanced-0").iterations_per_keyframe, usual.iterations_per_keyframe);
     assert!(quality.iterations_per_keyframe > usual.iterations_per_keyframe);
-    let all = csv_of(&["--budgets", "quality", "--iterations", "2,3"]);
+    let all = csv_of(&["--presets", "quality", "--iterations", "2,3"]);
     assert!(all.lines().count() == 3 && all.contains("\"quality, 2 steps\""), "{all}");
     let few = settings("quality--3-steps-0");
     assert_eq!((few.iterations_per_keyframe, few.seeding.detail), (3, quality.seeding.detail));
