@@ -237,7 +237,7 @@ mod tests {
         assert!(message.contains("run.toml") && message.contains("line 3") && message.contains("ssim_wieght"), "{message}");
         let wrong = |text: &str| toml::from_str::<Config>(text).unwrap().validate().unwrap_err().to_string();
         assert!(wrong("map_scale = 2.0").contains("map_scale"));
-        assert!(wrong("[mapping.seeding]\nstride = 0").contains("stride"));
+        assert!(wrong("[mapping.insertion]\nstride = 0").contains("stride"));
         assert!(wrong("[mapping.adam]\nbeta_1 = 1.0").contains("beta_1"));
     }
 

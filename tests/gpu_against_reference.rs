@@ -166,7 +166,7 @@ fn the_loss_and_its_whole_gradient_agree() {
 fn adam_steps_agree() {
     let Some(gpu) = gpu() else { return };
     let loss = LossConfig::default();
-    let adam = AdamConfig { harmonics_every: 1, color_settling_steps: 2.0, averaged_steps: 1.5, ..AdamConfig::default() };
+    let adam = AdamConfig { harmonics_every: 1, color_settling_steps: 2.0, ema_steps: 1.5, ..AdamConfig::default() };
     let mut rng = Rng::with_seed(11);
     let camera = common::camera(&mut rng, 48, 32);
     let mut cloud = common::scene(&mut rng, 60, ShDegree::ALL[1]);
@@ -183,13 +183,13 @@ fn adam_steps_agree() {
         let gradients = optimiser.gradients(&mut rasterizer, &on_gpu, &camera, &image, &loss).unwrap();
         for (i, gradient) in cloud64(&gradients.cloud).iter().enumerate() {
             let size = (expected[i][3..6].iter().sum::<f64>() / 3.0).exp();
-            let mut rates = vec![f64::from(adam.position_rate) * size; 3];
-            rates.extend([f64::from(adam.scale_rate); 3]);
-            rates.extend([f64::from(adam.rotation_rate); 4]);
-            rates.push(f64::from(adam.opacity_rate));
+            let mut rates = vec![f64::from(adam.lr_position) * size; 3];
+            rates.extend([f64::from(adam.lr_log_scale); 3]);
+            rates.extend([f64::from(adam.lr_rotation); 4]);
+            rates.push(f64::from(adam.lr_opacity));
             let pace = (1.0 + f64::from(states[i].steps + 1) / 2.0).sqrt().recip();
-            rates.extend([f64::from(adam.color_rate) * pace; 3]);
-            rates.extend([f64::from(adam.harmonics_rate) * pace; 9]);
+            rates.extend([f64::from(adam.lr_color) * pace; 3]);
+            rates.extend([f64::from(adam.lr_harmonics) * pace; 9]);
             let decay = (f64::from(adam.beta_1), f64::from(adam.beta_2), f64::from(adam.epsilon));
             let before = states[i].steps;
             states[i].step(&mut expected[i], &gradient.flat(), &rates, decay);
@@ -279,10 +279,10 @@ fn depth_that_is_trusted_by_a_quarter_counts_as_if_it_had_a_quarter_of_the_weigh
     let cloud = common::scene(&mut rng, 200, ShDegree::default());
     let (image, wide) = target(&mut rng, camera.pinhole);
     let image = upload_target(&gpu, &image, &wide);
-    let learn = |depth_trust: f32, depth_weight: f32| {
+    let learn = |depth_confidence: f32, depth_weight: f32| {
         let mut rasterizer = Rasterizer::new(gpu.clone()).unwrap();
         let on_gpu = upload(&gpu, &cloud);
-        let views = [TrainingView { depth_trust, ..TrainingView::new(camera, &image) }; 5];
+        let views = [TrainingView { depth_confidence, ..TrainingView::new(camera, &image) }; 5];
         let loss = LossConfig { depth_weight, ..LossConfig::default() };
         let configs = (&loss, &AdamConfig::default());
         let reports = Optimiser::new(&rasterizer).unwrap().steps(&mut rasterizer, &on_gpu, &views, configs).unwrap();
@@ -307,7 +307,7 @@ fn pairs_that_outgrow_their_buffers_are_never_dropped() {
     // 400 Gaussians over most of 1200 tiles: more than the first buffers hold.
     let first = rasterizer.render(&on_gpu, &camera, BACKGROUND).unwrap();
     let counts = rasterizer.finish().unwrap().unwrap();
-    assert!(counts.pairs > 131_072, "the scene does not overflow: {counts:?}");
+    assert!(counts.intersections > 131_072, "the scene does not overflow: {counts:?}");
     assert_eq!(first, rasterizer.render(&on_gpu, &camera, BACKGROUND).unwrap(), "rendering is repeatable to the bit");
 
     // Training: steps that did not fit are repeated, and all of them count.
@@ -317,6 +317,6 @@ fn pairs_that_outgrow_their_buffers_are_never_dropped() {
     let views = [TrainingView::new(camera, &image); 3];
     let configs = (&LossConfig::default(), &AdamConfig::default());
     let reports = Optimiser::new(&rasterizer).unwrap().steps(&mut rasterizer, &on_gpu, &views, configs).unwrap();
-    assert!(reports.iter().all(|r| r.counts.pairs > 131_072 && r.loss.l1 > 0.0), "{reports:?}");
+    assert!(reports.iter().all(|r| r.counts.intersections > 131_072 && r.loss.l1 > 0.0), "{reports:?}");
     assert!(reports[2].loss.total(configs.0) < reports[0].loss.total(configs.0), "the steps did not descend");
 }

@@ -7,7 +7,7 @@ use fastrand::Rng;
 use glam::Vec3;
 use image::{Rgb, RgbImage};
 use keysplat::gpu::Gpu;
-use keysplat::optimise::{AdamConfig, LossConfig, Optimiser, TargetImage, TileSkip, TrainingView};
+use keysplat::optimise::{AdamConfig, LossConfig, Optimiser, TargetImage, TileSampling, TrainingView};
 use keysplat::render::{GpuCloud, Rasterizer};
 use keysplat::splat::ShDegree;
 
@@ -47,8 +47,8 @@ fn two_hundred_steps_on_noise_end_finite() {
         let depth: Vec<f32> =
             (0..48 * 32).map(|_| if rng.f32() < 0.2 { 0.0 } else { common::between(&mut rng, 0.05, 60.0) }).collect();
         let target = TargetImage::new(&gpu, &image, Some(&depth)).unwrap();
-        let skip = (seed % 2 == 1).then_some(TileSkip { share: 0.5, least: 0.1, noise: 0.0 });
-        let view = TrainingView { skip, ..TrainingView::new(camera, &target) };
+        let skip = (seed % 2 == 1).then_some(TileSampling { share: 0.5, min_share: 0.1, noise: 0.0 });
+        let view = TrainingView { tile_sampling: skip, ..TrainingView::new(camera, &target) };
         let mut losses = Vec::new();
         for _ in 0..STEPS / BATCH {
             let reports = optimiser.steps(&mut rasterizer, &on_gpu, &[view; BATCH], (&LossConfig::default(), &adam)).unwrap();
@@ -68,7 +68,7 @@ fn two_hundred_steps_on_noise_end_finite() {
             assert!(finite, "scene {seed}, Gaussian {i}: {now:?}");
             // Adam moves a log scale by no more than about its rate a step.
             let growth = (now.log_scale - before.log_scale).max_element();
-            assert!(growth < 1.5 * STEPS as f32 * adam.scale_rate, "scene {seed}, Gaussian {i} grew by e^{growth}");
+            assert!(growth < 1.5 * STEPS as f32 * adam.lr_log_scale, "scene {seed}, Gaussian {i} grew by e^{growth}");
             if now != before {
                 let limit = adam.max_elongation * 1.001;
                 assert!(elongation(now.log_scale) <= limit, "scene {seed}, Gaussian {i} is a needle: {:?}", now.log_scale);

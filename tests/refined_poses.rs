@@ -89,7 +89,7 @@ fn a_disturbed_keyframe_returns_to_the_truth() {
         }
     };
     let off = RefinePosesConfig::default();
-    let on = RefinePosesConfig { enabled: true, rotation_rate: 3e-4, translation_rate: 6e-4, pull: 0.0, ..off.clone() };
+    let on = RefinePosesConfig { enabled: true, lr_rotation: 3e-4, lr_translation: 6e-4, pull: 0.0, ..off.clone() };
     assert!(refined(&gpu, RefinePosesConfig { enabled: false, ..off }).0.is_empty());
     let (pairs, map) = refined(&gpu, on.clone());
     assert!(pairs.len() >= 4, "{pairs:?}");

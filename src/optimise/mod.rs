@@ -6,10 +6,10 @@ mod kernels;
 mod loss;
 mod optimiser;
 mod scores;
-mod skip;
+mod tile_sampling;
 
 pub use adam::AdamConfig;
 pub use loss::{LossConfig, LossTerms, TargetImage};
 pub use optimiser::{Gradients, Optimiser, OptimiserState, StepReport, TrainingView};
 pub use scores::{GaussianScore, WrongPixels};
-pub use skip::TileSkip;
+pub use tile_sampling::TileSampling;

@@ -11,7 +11,7 @@ use bytemuck::{Pod, Zeroable};
 use super::image_buffers::{self, ImageBuffers, LOSS_TILE};
 use super::kernels::Kernels;
 use super::scores::{GaussianScore, Scores, WrongPixels};
-use super::skip::{SkippedTiles, TileSkip};
+use super::tile_sampling::{TileSampler, TileSampling};
 use super::{AdamConfig, LossConfig, LossTerms, TargetImage};
 use crate::gpu::{Gpu, GpuBuffer, GpuError};
 use crate::render::layout::{AdamSetup, COUNTERS, Counter, LossSetup, VISIBLE_COUNTER, View};
@@ -34,18 +34,18 @@ pub struct TrainingView<'a> {
     pub target: &'a TargetImage,
     /// Whether the step also scores the Gaussians (see [`Optimiser::begin_scores`]).
     pub scored: Option<WrongPixels>,
-    /// Share of Adam's step sizes that the step takes.
-    pub pace: f32,
-    /// Share of its weight in the loss that the target's depth deserves: 1 if a sensor measured it.
-    pub depth_trust: f32,
-    /// Which tiles are left out; a scored step leaves none.
-    pub skip: Option<TileSkip>,
+    /// Factor on all learning rates of the step.
+    pub lr_scale: f32,
+    /// Factor on the weight of the target's depth in the loss: 1 if a sensor measured it.
+    pub depth_confidence: f32,
+    /// Tiles that the step samples; `None`: all. A scored step uses all.
+    pub tile_sampling: Option<TileSampling>,
 }
 
 impl<'a> TrainingView<'a> {
-    /// The whole view at full pace, not scored.
+    /// The whole view at full learning rates, not scored.
     pub fn new(camera: ViewCamera, target: &'a TargetImage) -> Self {
-        Self { camera, target, scored: None, pace: 1.0, depth_trust: 1.0, skip: None }
+        Self { camera, target, scored: None, lr_scale: 1.0, depth_confidence: 1.0, tile_sampling: None }
     }
 }
 
@@ -70,8 +70,13 @@ pub struct Gradients {
 
 /// Where the backward pass starts from.
 enum Objective<'a> {
-    /// With the trust in the target's depth, the Gaussians' scores on the way, if asked for, and the tiles to leave out with the draw's seed.
-    Image { target: &'a TargetImage, loss: (&'a LossConfig, f32), scored: Option<&'a WrongPixels>, skip: Option<(TileSkip, u32)> },
+    /// With the confidence in the target's depth, the scores to compute, and the tile sampling with the seed of its draw.
+    Image {
+        target: &'a TargetImage,
+        loss: (&'a LossConfig, f32),
+        scored: Option<&'a WrongPixels>,
+        tile_sampling: Option<(TileSampling, u32)>,
+    },
     /// Gradients by the image are in the buffer already.
     Given,
 }
@@ -87,7 +92,7 @@ enum Sink<'a> {
 pub struct Optimiser {
     kernels: Kernels,
     scores: Scores,
-    skipped: SkippedTiles,
+    sampler: TileSampler,
     /// Steps submitted so far, and the host's time to encode and submit them.
     steps: usize,
     encode_time: Duration,
@@ -114,7 +119,7 @@ impl Optimiser {
         Ok(Self {
             kernels,
             scores: Scores::new(rasterizer)?,
-            skipped: SkippedTiles::new(rasterizer)?,
+            sampler: TileSampler::new(rasterizer)?,
             steps: 0,
             encode_time: Duration::ZERO,
             adam: GpuBuffer::uniform(gpu, "Adam", &AdamSetup::zeroed())?,
@@ -128,7 +133,7 @@ impl Optimiser {
     }
 
     /// For each view in turn: renders the map, compares it with the target, and moves the Gaussians that were blended by one step of
-    /// Adam. The steps are submitted without waiting in between; what they report is read at the end. A step whose pairs did not
+    /// Adam. The steps are submitted without waiting in between; what they report is read at the end. A step whose intersections did not
     /// fit moved nothing and is repeated after the others, with larger buffers.
     pub fn steps(
         &mut self,
@@ -143,11 +148,12 @@ impl Optimiser {
         let mut pending: Vec<usize> = (0..views.len()).collect();
         while !pending.is_empty() {
             for (entry, &i) in pending.iter().enumerate() {
-                let TrainingView { camera, target, scored, pace, depth_trust, skip } = &views[i];
-                let skip = skip.filter(|_| scored.is_none()).map(|skip| (skip, self.steps as u32));
-                let objective = Objective::Image { target, loss: (loss, *depth_trust), scored: scored.as_ref(), skip };
+                let TrainingView { camera, target, scored, lr_scale, depth_confidence, tile_sampling } = &views[i];
+                let tile_sampling = tile_sampling.filter(|_| scored.is_none()).map(|sampling| (sampling, self.steps as u32));
+                let objective =
+                    Objective::Image { target, loss: (loss, *depth_confidence), scored: scored.as_ref(), tile_sampling };
                 let started = Instant::now();
-                self.adam.write(&gpu, 0, &[adam.setup(self.steps, *pace)]);
+                self.adam.write(&gpu, 0, &[adam.setup(self.steps, *lr_scale)]);
                 self.steps += 1;
                 let mut encoder = gpu.device.create_command_encoder(&Default::default());
                 self.encode(&mut encoder, rasterizer, cloud, (camera, [0.0; 3]), &objective, &Sink::Adam)?;
@@ -169,7 +175,7 @@ impl Optimiser {
                 }
             }
             for entry in &entries {
-                rasterizer.make_room(&entry.counters)?;
+                rasterizer.reserve_for(&entry.counters)?;
             }
             pending = repeat;
         }
@@ -211,7 +217,7 @@ impl Optimiser {
         loss: &LossConfig,
     ) -> Result<Gradients, GpuError> {
         let gpu = rasterizer.gpu().clone();
-        let objective = Objective::Image { target, loss: (loss, 1.0), scored: None, skip: None };
+        let objective = Objective::Image { target, loss: (loss, 1.0), scored: None, tile_sampling: None };
         let mut gradients = self.collect(rasterizer, cloud, camera, [0.0; 3], &objective)?;
         gradients.loss = self.read_loss(&gpu, target)?;
         Ok(gradients)
@@ -253,7 +259,7 @@ impl Optimiser {
         Ok(Gradients { loss: LossTerms::default(), cloud, pose: tangent([pose[0], pose[1]]) })
     }
 
-    /// Submits one step and waits, again with larger buffers if its pairs did not fit.
+    /// Submits one step and waits, again with larger buffers if its intersections did not fit.
     fn run(
         &mut self,
         rasterizer: &mut Rasterizer,
@@ -295,12 +301,12 @@ impl Optimiser {
             encoder.clear_buffer(buffer.raw(), 0, None);
         }
         let mut pass = encoder.begin_compute_pass(&Default::default());
-        if let Objective::Image { loss: (loss, _), skip: Some(skip), .. } = objective {
-            self.skipped.encode_select(&mut pass, rasterizer, &self.images[0], loss, skip);
+        if let Objective::Image { loss: (loss, _), tile_sampling: Some((sampling, seed)), .. } = objective {
+            self.sampler.encode_sample(&mut pass, rasterizer, &self.images[0], loss, sampling, *seed);
         }
         rasterizer.encode_forward(&mut pass, cloud.parameters(), &prepared);
-        if let Objective::Image { loss, scored, skip, .. } = objective {
-            skip.iter().for_each(|_| self.skipped.encode_fill(&mut pass, rasterizer, &self.images[0]));
+        if let Objective::Image { loss, scored, tile_sampling, .. } = objective {
+            tile_sampling.iter().for_each(|_| self.sampler.encode_fill(&mut pass, rasterizer, &self.images[0]));
             self.encode_loss(&mut pass, rasterizer, *loss);
             let image = (&self.images[0].gradients, &self.loss_total);
             scored.iter().for_each(|wrong| self.scores.encode(&mut pass, rasterizer, &prepared, image, (wrong, loss.0)));
@@ -314,18 +320,23 @@ impl Optimiser {
         Ok(())
     }
 
-    fn encode_loss(&self, pass: &mut wgpu::ComputePass<'_>, rasterizer: &Rasterizer, (loss, depth_trust): (&LossConfig, f32)) {
+    fn encode_loss(
+        &self,
+        pass: &mut wgpu::ComputePass<'_>,
+        rasterizer: &Rasterizer,
+        (loss, depth_confidence): (&LossConfig, f32),
+    ) {
         let (gpu, ws, k) = (rasterizer.gpu(), &rasterizer.workspace, &self.kernels);
         let TargetImage { width, height, color, depth, .. } = &self.images[0].target;
         let (width, height) = (*width, *height);
         let LossConfig { ssim_weight, depth_weight, precise_depth_metres: precise_depth } = *loss;
-        let setup = LossSetup { width, height, ssim_weight, depth_weight, precise_depth, depth_trust };
+        let setup = LossSetup { width, height, ssim_weight, depth_weight, precise_depth, depth_confidence };
         self.loss_setup.write(gpu, 0, &[setup]);
         let forward = [width.div_ceil(LOSS_TILE), height.div_ceil(LOSS_TILE / 2), 1];
         let backward = [width.div_ceil(LOSS_TILE), height.div_ceil(LOSS_TILE), 1];
         let inputs =
             [(0, &self.loss_setup), (1, &ws.color_depth), (2, &ws.state), (3, color), (4, depth), (5, &self.images[0].partials)];
-        let with = |last| inputs.iter().copied().chain([last, (7, &ws.skipped)]).collect::<Vec<_>>();
+        let with = |last| inputs.iter().copied().chain([last, (7, &ws.unsampled)]).collect::<Vec<_>>();
         k.loss_forward.dispatch(gpu, pass, &with((6, &self.images[0].loss_sums)), forward);
         k.loss_reduce.dispatch(gpu, pass, &[(0, &self.images[0].loss_sums), (1, &self.loss_total)], [1, 1, 1]);
         k.loss_backward.dispatch(gpu, pass, &with((6, &self.images[0].gradients)), backward);
@@ -349,14 +360,14 @@ impl Optimiser {
             (5, &ws.color_depth),
             (6, &ws.state),
             (7, &self.images[0].gradients),
-            (8, &ws.pair_gradients),
+            (8, &ws.intersection_gradients),
         ];
         k.rasterize_backward.dispatch(gpu, pass, &blend, rasterizer.form().workgroups(prepared.view.tiles()));
         let mut project = vec![
             (0, rasterizer.view()),
             (1, &ws.counters),
-            (2, &ws.pair_counts),
-            (3, &ws.pair_gradients),
+            (2, &ws.intersection_counts),
+            (3, &ws.intersection_gradients),
             (4, &self.pose_sums),
             (5, cloud.parameters()),
         ];

@@ -7,7 +7,7 @@ use image::{Rgb, RgbImage};
 use super::scenes::{Fault, Scene, between};
 use super::{Family, Machine, Outcome, Part};
 use crate::gpu::GpuError;
-use crate::optimise::{AdamConfig, LossConfig, TargetImage, TileSkip, TrainingView};
+use crate::optimise::{AdamConfig, LossConfig, TargetImage, TileSampling, TrainingView};
 use crate::splat::{Gaussian, GaussianCloud};
 
 const STEPS: usize = 200;
@@ -50,9 +50,9 @@ fn train(machine: &Machine, rng: &mut Rng, scene: &Scene, fault: Fault) -> Resul
     let target = target(machine, rng, size)?;
     let (loss, adam) = (LossConfig::default(), AdamConfig::default());
     let on_gpu = machine.upload(&scene.cloud)?;
-    let skip = rng.bool().then_some(TileSkip { share: 0.5, least: 0.1, noise: 0.0 });
-    let view = TrainingView { skip, ..TrainingView::new(scene.camera, &target) };
-    let whole = TrainingView { skip: None, ..view };
+    let skip = rng.bool().then_some(TileSampling { share: 0.5, min_share: 0.1, noise: 0.0 });
+    let view = TrainingView { tile_sampling: skip, ..TrainingView::new(scene.camera, &target) };
+    let whole = TrainingView { tile_sampling: None, ..view };
     machine.with(rng.usize(..2), |rasterizer, optimiser| {
         let mut outcome = Outcome::default();
         let mut losses = Vec::new();
@@ -126,7 +126,7 @@ fn check_parameters(outcome: &mut Outcome, before: &GaussianCloud, after: &Gauss
         opacity = opacity.max((new.raw_opacity - old.raw_opacity).abs());
         needles += usize::from(new != old && elongation(new.log_scale) > adam.max_elongation.ln() + 1e-3);
     }
-    outcome.measure("growth of a log scale", growth.into(), (reach * adam.scale_rate).into());
-    outcome.measure("change of a raw opacity", opacity.into(), (reach * adam.opacity_rate).into());
+    outcome.measure("growth of a log scale", growth.into(), (reach * adam.lr_log_scale).into());
+    outcome.measure("change of a raw opacity", opacity.into(), (reach * adam.lr_opacity).into());
     outcome.require(needles == 0, || format!("{needles} Gaussians that moved are needles"));
 }
