@@ -7,8 +7,8 @@ use fastrand::Rng;
 use glam::Vec3;
 use image::{Rgb, RgbImage};
 use keysplat::gpu::Gpu;
-use keysplat::optimise::{AdamConfig, LossConfig, Optimiser, TargetImage, TileSampling, TrainingView};
-use keysplat::render::{GpuCloud, Rasterizer};
+use keysplat::optimise::{AdamConfig, LossConfig, TargetImage, TileSampling, Trainer, TrainingView};
+use keysplat::render::GpuCloud;
 use keysplat::splat::ShDegree;
 
 const SCENES: u64 = 12;
@@ -29,8 +29,7 @@ fn two_hundred_steps_on_noise_end_finite() {
         return;
     };
     let adam = AdamConfig::default();
-    let mut rasterizer = Rasterizer::new(gpu.clone()).unwrap();
-    let mut optimiser = Optimiser::new(&rasterizer).unwrap();
+    let mut trainer = Trainer::new(gpu.clone()).unwrap();
     let mut blunted = 0;
     for seed in 0..SCENES {
         let mut rng = Rng::with_seed(900 + seed);
@@ -51,7 +50,7 @@ fn two_hundred_steps_on_noise_end_finite() {
         let view = TrainingView { tile_sampling: skip, ..TrainingView::new(camera, &target) };
         let mut losses = Vec::new();
         for _ in 0..STEPS / BATCH {
-            let reports = optimiser.steps(&mut rasterizer, &on_gpu, &[view; BATCH], (&LossConfig::default(), &adam)).unwrap();
+            let reports = trainer.steps(&on_gpu, &[view; BATCH], &LossConfig::default(), &adam).unwrap();
             losses.extend(reports.iter().map(|r| r.loss.total(&LossConfig::default())));
             assert!(reports.iter().all(|r| r.pose.iter().all(|v| v.is_finite())), "scene {seed}: pose gradient");
         }

@@ -6,7 +6,7 @@ use fastrand::Rng;
 use glam::Vec3;
 use image::{Rgb, RgbImage};
 use keysplat::gpu::Gpu;
-use keysplat::optimise::{AdamConfig, LossConfig, Optimiser, StepReport, TargetImage, TileSampling, TrainingView};
+use keysplat::optimise::{AdamConfig, LossConfig, StepReport, TargetImage, TileSampling, Trainer, TrainingView};
 use keysplat::render::{BlendForm, GpuCloud, Rasterizer};
 use keysplat::splat::{GaussianCloud, ShDegree};
 
@@ -30,8 +30,7 @@ struct Steps<'a> {
 impl Steps<'_> {
     /// The map after a step of each kind, one after the other on the same target, and what they reported. The first moves nothing.
     fn run(&self, skips: &[Option<TileSampling>]) -> (GaussianCloud, Vec<StepReport>) {
-        let mut rasterizer = Rasterizer::with_form(self.gpu.clone(), self.form).unwrap();
-        let mut optimiser = Optimiser::new(&rasterizer).unwrap();
+        let mut trainer = Trainer::with_form(self.gpu.clone(), self.form).unwrap();
         let mut on_gpu = GpuCloud::new(&self.gpu, self.cloud.sh_degree, self.cloud.len()).unwrap();
         on_gpu.append(&self.gpu, self.cloud).unwrap();
         let target = TargetImage::new(&self.gpu, self.image, None).unwrap();
@@ -39,7 +38,7 @@ impl Steps<'_> {
         for (i, skip) in skips.iter().enumerate() {
             let lr_scale = if i == 0 { 0.0 } else { 1.0 };
             let view = TrainingView { lr_scale, tile_sampling: *skip, ..TrainingView::new(self.camera, &target) };
-            reports.extend(optimiser.steps(&mut rasterizer, &on_gpu, &[view], (&LOSS, &AdamConfig::default())).unwrap());
+            reports.extend(trainer.steps(&on_gpu, &[view], &LOSS, &AdamConfig::default()).unwrap());
         }
         (on_gpu.download(&self.gpu).unwrap(), reports)
     }

@@ -10,8 +10,8 @@ use super::rates::Rates;
 use super::scene::BenchScene;
 use super::work::{Work, count_work};
 use crate::gpu::{Gpu, GpuError};
-use crate::optimise::{AdamConfig, LossConfig, Optimiser, TileSampling, TrainingView};
-use crate::render::{BlendForm, Rasterizer};
+use crate::optimise::{AdamConfig, LossConfig, TileSampling, Trainer, TrainingView};
+use crate::render::BlendForm;
 use crate::splat::ShDegree;
 
 /// What to measure.
@@ -63,8 +63,7 @@ const BATCH: usize = 4;
 pub struct StepRunner {
     gpu: Arc<Gpu>,
     scene: BenchScene,
-    rasterizer: Rasterizer,
-    optimiser: Optimiser,
+    trainer: Trainer,
     still: AdamConfig,
     tile_sampling: Option<TileSampling>,
     /// The work in one step.
@@ -90,12 +89,11 @@ impl StepRunner {
         form: BlendForm,
         tile_sampling: Option<TileSampling>,
     ) -> Result<Self, GpuError> {
-        let mut rasterizer = Rasterizer::with_form(gpu.clone(), form)?;
-        let optimiser = Optimiser::new(&rasterizer)?;
-        let work = count_work(&mut rasterizer, &scene.cloud, &scene.camera)?;
+        let mut trainer = Trainer::with_form(gpu.clone(), form)?;
+        let work = count_work(&mut trainer, &scene.cloud, &scene.camera)?;
         // Rates of zero keep the scene as it is, step after step, at the same cost.
         let still = AdamConfig::default().scaled(0.0, 0.0);
-        let mut runner = Self { gpu: gpu.clone(), scene, rasterizer, optimiser, still, tile_sampling, work };
+        let mut runner = Self { gpu: gpu.clone(), scene, trainer, still, tile_sampling, work };
         for _ in 0..WARM_UP {
             runner.steps(1)?;
         }
@@ -106,24 +104,23 @@ impl StepRunner {
     fn steps(&mut self, count: usize) -> Result<(), GpuError> {
         let (camera, target, tile_sampling) = (self.scene.camera, &self.scene.target, self.tile_sampling);
         let views = [TrainingView { tile_sampling, ..TrainingView::new(camera, target) }; BATCH];
-        let configs = (&LossConfig::default(), &self.still);
-        self.optimiser.steps(&mut self.rasterizer, &self.scene.cloud, &views[..count], configs)?;
+        self.trainer.steps(&self.scene.cloud, &views[..count], &LossConfig::default(), &self.still)?;
         Ok(())
     }
 
     /// Runs a batch of steps and waits for them.
     pub fn run(&mut self) -> Result<StepTimes, GpuError> {
         let share = BATCH as u32;
-        let encoded = self.optimiser.encode_time();
+        let encoded = self.trainer.encode_time();
         let started = Instant::now();
         self.steps(BATCH)?;
         let wall = started.elapsed() / share;
-        let encoding = (self.optimiser.encode_time() - encoded) / share;
+        let encoding = (self.trainer.encode_time() - encoded) / share;
         let mut stages = BTreeMap::<_, Duration>::new();
         for (label, ms) in self.gpu.take_profile()?.unwrap_or_default() {
             *stages.entry(label).or_default() += Duration::from_secs_f64(ms * 1e-3 / f64::from(share));
         }
-        stages.remove(Optimiser::END_MARK);
+        stages.remove(Trainer::END_MARK);
         Ok(StepTimes { wall, encoding, stages })
     }
 }

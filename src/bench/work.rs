@@ -4,8 +4,9 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 use crate::gpu::GpuError;
+use crate::optimise::Trainer;
 use crate::render::layout::{TILE_HEIGHT, TILE_WIDTH};
-use crate::render::{GpuCloud, Rasterizer, ViewCounts};
+use crate::render::{GpuCloud, ViewCounts};
 use crate::splat::model::{ALPHA_MAX, TRANSMITTANCE_MIN, ViewCamera};
 
 /// Counted work of one view.
@@ -33,7 +34,8 @@ struct TileWork {
 }
 
 /// Renders the view once more and counts.
-pub fn count_work(rasterizer: &mut Rasterizer, cloud: &GpuCloud, camera: &ViewCamera) -> Result<Work, GpuError> {
+pub fn count_work(trainer: &mut Trainer, cloud: &GpuCloud, camera: &ViewCamera) -> Result<Work, GpuError> {
+    let rasterizer = trainer.rasterizer_mut();
     let rendered = rasterizer.render(cloud, camera, [0.0; 3])?;
     let counts: ViewCounts = rasterizer.finish()?.unwrap_or_default();
     let gpu = rasterizer.gpu().clone();

@@ -130,7 +130,7 @@ impl Default for TileSamplingConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct InsertionConfig {
-    /// One seed per `stride`² pixels where the image has most detail, and per `flat_stride`² where it is flat.
+    /// One Gaussian per `stride`² pixels where the image has most detail, and per `flat_stride`² where it is flat.
     pub stride: u32,
     pub flat_stride: u32,
     /// Standard deviation of a block's colours (0 to 1) above which the block is quartered.
@@ -142,13 +142,13 @@ pub struct InsertionConfig {
     /// A block whose brightness differs from its surroundings by this much more in the image than in the render, or less, misses detail;
     /// 0 to 1, 1: none does.
     pub missed_detail: f32,
-    /// Standard deviation of a seed in units of its spacing on the surface.
+    /// Standard deviation of a new Gaussian in units of its spacing on the surface.
     pub footprint: f32,
-    /// Standard deviation of a seed across its surface in units of that along it.
+    /// Standard deviation of a new Gaussian across its surface in units of that along it.
     pub thickness: f32,
-    /// Opacity of a seed.
+    /// Opacity of a new Gaussian.
     pub opacity: f32,
-    /// No seed nearer to the camera or farther than this, metres.
+    /// No Gaussian is inserted nearer to the camera or farther than this, metres.
     pub min_depth_metres: f32,
     pub max_depth_metres: f32,
 }
@@ -227,10 +227,10 @@ impl MappingConfig {
     /// For recordings whose poses are known: keyframes only arrive, and the refinement makes the map.
     pub fn offline() -> Self {
         let refine = RefineConfig { steps: 6000, ..RefineConfig::default() };
-        // Points and seeds lie further from where they belong than those of a depth image do. The refinement lets all rates fall by itself,
+        // Points and inserted Gaussians lie further from where they belong than those of a depth image do. The refinement lets all rates fall by itself,
         // which leaves averages nothing but to lag behind.
         let adam = AdamConfig { lr_position: 0.16, color_settling_steps: 0.0, ema_steps: 1.0, ..AdamConfig::default() };
-        // No keyframe seeds anything during the refinement: what the first Gaussians miss must grow out of them.
+        // No keyframe inserts anything during the refinement: what the first Gaussians miss must grow out of them.
         let mut density = DensityConfig::default();
         density.multi_view.max_growth = 0.15;
         Self { iterations_per_keyframe: 0, first_iterations: 0, refine, adam, density, ..Self::default() }

@@ -1,4 +1,4 @@
-//! What the mapper remembers of each Gaussian: the keyframe that it was seeded from (when a closed loop moves a keyframe, its Gaussians
+//! What the mapper remembers of each Gaussian: the keyframe that it was inserted from (when a closed loop moves a keyframe, its Gaussians
 //! go with it), its age, and what it was ever worth.
 
 use std::collections::BTreeMap;

@@ -15,8 +15,8 @@ const IMAGES_SHARE: f64 = 0.4;
 /// At least this many Gaussians are always allowed: less is no map.
 const LEAST_GAUSSIANS: usize = 1000;
 const LEAST_KEYFRAMES: usize = 8;
-/// Seeds of one keyframe may take at most this share of all places.
-const SEEDS_SHARE: f64 = 0.5;
+/// New Gaussians of one keyframe may take at most this share of all places.
+const INSERTED_SHARE: f64 = 0.5;
 
 /// What the mapper may use.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -75,9 +75,9 @@ impl LimitsConfig {
     }
 }
 
-/// How many of `seeds` may come into a map of at most `most` Gaussians.
-pub(super) fn seeds_allowed(seeds: usize, most: usize) -> usize {
-    seeds.min((SEEDS_SHARE * most as f64) as usize)
+/// How many of `inserted` new Gaussians may come into a map of at most `most` Gaussians.
+pub(super) fn insertions_allowed(inserted: usize, most: usize) -> usize {
+    inserted.min((INSERTED_SHARE * most as f64) as usize)
 }
 
 /// The Gaussians to keep so that at most `most` are left: the least useful go, the older first among equals. Ascending.

@@ -28,8 +28,8 @@ use super::{
 };
 use crate::geometry::Se3;
 use crate::gpu::{Gpu, GpuError};
-use crate::optimise::{GaussianScore, Optimiser, StepReport, TrainingView, WrongPixels};
-use crate::render::{GpuCloud, Rasterizer, Rendered};
+use crate::optimise::{GaussianScore, StepReport, Trainer, TrainingView, WrongPixels};
+use crate::render::{GpuCloud, Rendered};
 use crate::sequence::{KnownPoint, RectifiedImage};
 use crate::splat::{Exposure, GaussianCloud, ViewCamera};
 
@@ -58,7 +58,8 @@ pub enum MappingError {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct KeyframeReport {
     pub id: KeyframeId,
-    pub seeded: usize,
+    /// Gaussians inserted.
+    pub inserted: usize,
     pub pruned: usize,
     /// Gaussians that came by dividing others.
     pub grown: usize,
@@ -76,8 +77,7 @@ pub struct KeyframeReport {
 pub struct Mapper {
     config: MappingConfig,
     gpu: Arc<Gpu>,
-    rasterizer: Rasterizer,
-    optimiser: Optimiser,
+    trainer: Trainer,
     cloud: GpuCloud,
     stats: GaussianStats,
     keyframes: Vec<MappedKeyframe>,
@@ -87,11 +87,9 @@ pub struct Mapper {
 
 impl Mapper {
     pub fn new(gpu: Arc<Gpu>, config: &MappingConfig) -> Result<Self, MappingError> {
-        let rasterizer = Rasterizer::new(gpu.clone())?;
         Ok(Self {
             config: config.clone(),
-            optimiser: Optimiser::new(&rasterizer)?,
-            rasterizer,
+            trainer: Trainer::new(gpu.clone())?,
             cloud: GpuCloud::new(&gpu, config.sh_degree, FIRST_CAPACITY)?,
             stats: GaussianStats::default(),
             keyframes: Vec::new(),
@@ -101,7 +99,7 @@ impl Mapper {
         })
     }
 
-    /// Takes in a keyframe: seeds what the map lacks, optimises over the window, prunes. `stop` is asked between the steps. A keyframe without
+    /// Takes in a keyframe: inserts what the map lacks, optimises over the window, prunes. `stop` is asked between the steps. A keyframe without
     /// depth is passed over until there is a map.
     pub fn insert(&mut self, keyframe: &Keyframe, stop: &dyn Fn() -> bool) -> Result<KeyframeReport, MappingError> {
         if keyframe.image.depth.is_none() && self.has_not_begun() {
@@ -113,35 +111,35 @@ impl Mapper {
         if exposure != Exposure::default() {
             keyframe.to_mut().image.color = exposure::corrected(&keyframe.image.color, &exposure);
         }
-        // Before its seeds: a bound on memory leaves these what the image has left.
+        // Before its seeds: a bound on memory leaves to it what the image has left.
         let mapped = MappedKeyframe::new(&self.gpu, &keyframe, exposure, self.config.learns_at_half_size())?;
         self.keyframes.push(mapped);
         self.limit_keyframes();
-        let seeded = self.seed(&keyframe, rendered.as_ref())?;
+        let inserted = self.insert_gaussians(&keyframe, rendered.as_ref())?;
         let first = self.keyframes.len() == 1;
         let iterations = if first { self.config.first_iterations } else { self.config.iterations_per_keyframe };
         if iterations == 0 {
             return Ok(KeyframeReport {
                 id: keyframe.id,
-                seeded,
+                inserted,
                 gaussians: self.cloud.len(),
                 exposure,
                 ..KeyframeReport::default()
             });
         }
         let report = self.optimise(iterations, stop)?;
-        Ok(KeyframeReport { id: keyframe.id, seeded, gaussians: self.cloud.len(), exposure, ..report })
+        Ok(KeyframeReport { id: keyframe.id, inserted, gaussians: self.cloud.len(), exposure, ..report })
     }
 
     /// Takes in points of the scene that are known before any keyframe, in the keyframes' world; `anchor` is the first of these.
     pub fn add_points(&mut self, known: &[KnownPoint], anchor: KeyframeId) -> Result<(), MappingError> {
-        let seeds = initialise_from_points::gaussians(known, &self.config.points, self.config.sh_degree);
-        let left_out = self.cloud.append(&self.gpu, &seeds)?;
-        self.stats.append(anchor, seeds.len() - left_out);
+        let new = initialise_from_points::gaussians(known, &self.config.points, self.config.sh_degree);
+        let left_out = self.cloud.append(&self.gpu, &new)?;
+        self.stats.append(anchor, new.len() - left_out);
         Ok(())
     }
 
-    /// Moves earlier keyframes to better poses, and with those that move far the Gaussians seeded from them; returns how many. Unknown
+    /// Moves earlier keyframes to better poses, and with those that move far the Gaussians inserted from them; returns how many. Unknown
     /// ids are those that were never sent to the mapper.
     pub fn update_poses(&mut self, updates: &[(KeyframeId, Se3)]) -> Result<usize, MappingError> {
         let mut motions = BTreeMap::new();
@@ -175,7 +173,7 @@ impl Mapper {
 
     /// Renders the map over black.
     pub fn render(&mut self, camera: &ViewCamera) -> Result<Rendered, MappingError> {
-        Ok(self.rasterizer.render(&self.cloud, camera, [0.0; 3])?)
+        Ok(self.trainer.render(&self.cloud, camera, [0.0; 3])?)
     }
 
     /// Duration of each step so far: its share of its batch.
@@ -225,22 +223,22 @@ impl Mapper {
         shown.map_or(last, |rendered| exposure::measure(image, rendered, &last, config))
     }
 
-    fn seed(&mut self, keyframe: &Keyframe, rendered: Option<&Rendered>) -> Result<usize, MappingError> {
+    fn insert_gaussians(&mut self, keyframe: &Keyframe, rendered: Option<&Rendered>) -> Result<usize, MappingError> {
         if keyframe.image.depth.is_none() {
             return Ok(0);
         }
-        let mut seeds = insertion::gaussians(keyframe, rendered, &self.config.insertion, self.config.sh_degree);
+        let mut new = insertion::gaussians(keyframe, rendered, &self.config.insertion, self.config.sh_degree);
         if self.config.limits.limits_gaussians() {
             let most = self.most_gaussians();
             self.cloud.limit(most);
-            seeds = seeds.thinned(limits::seeds_allowed(seeds.len(), most));
-            let keep = limits::most_useful(self.stats.histories(), most - seeds.len());
+            new = new.thinned(limits::insertions_allowed(new.len(), most));
+            let keep = limits::most_useful(self.stats.histories(), most - new.len());
             self.cloud.change(&self.gpu, &keep, (&[], &[]))?;
             self.stats.apply(&keep, std::iter::empty());
         }
-        let left_out = self.cloud.append(&self.gpu, &seeds)?;
-        self.stats.append(keyframe.id, seeds.len() - left_out);
-        Ok(seeds.len())
+        let left_out = self.cloud.append(&self.gpu, &new)?;
+        self.stats.append(keyframe.id, new.len() - left_out);
+        Ok(new.len())
     }
 
     /// How many Gaussians there may be, at present, when there is to be room for one more keyframe's image.
@@ -274,7 +272,7 @@ impl Mapper {
             return Ok((0, 0));
         }
         let scores = match self.scoring() {
-            Some(_) => self.optimiser.read_scores(&self.gpu, &self.cloud)?,
+            Some(_) => self.trainer.read_scores(&self.cloud)?,
             None => vec![GaussianScore::default(); self.cloud.len()],
         };
         self.stats.scored(&scores);
@@ -349,7 +347,7 @@ impl Mapper {
     /// A last step of each of some keyframes of the window, evenly spread over it, that scores the Gaussians; returns their number.
     fn score(&mut self, window: &[usize]) -> Result<usize, MappingError> {
         let Some(wrong) = self.scoring() else { return Ok(0) };
-        self.optimiser.begin_scores(&self.gpu, &self.cloud)?;
+        self.trainer.begin_scores(&self.cloud)?;
         let views = self.config.density.views.min(window.len());
         let chosen: Vec<Step> = (0..views)
             .map(|k| Step {
@@ -372,7 +370,7 @@ impl Mapper {
         };
         let views: Vec<TrainingView<'_>> = batch.iter().map(view).collect();
         let started = Instant::now();
-        let reports = self.optimiser.steps(&mut self.rasterizer, &self.cloud, &views, (&self.config.loss, &self.config.adam))?;
+        let reports = self.trainer.steps(&self.cloud, &views, &self.config.loss, &self.config.adam)?;
         self.step_times.extend(std::iter::repeat_n(started.elapsed() / batch.len().max(1) as u32, batch.len()));
         for (step, report) in batch.iter().zip(&reports) {
             let keyframe = &mut self.keyframes[step.keyframe];

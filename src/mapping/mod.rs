@@ -1,4 +1,4 @@
-//! The mapping thread's work: keyframes in, Gaussians seeded, optimised over a sliding window and pruned, snapshots out.
+//! The mapping thread's work: keyframes in, Gaussians inserted, optimised over a sliding window and pruned, snapshots out.
 //! A refinement over all keyframes may follow. Knows nothing of tracking; poses and covisibility arrive with the keyframes.
 
 mod config;

@@ -182,7 +182,7 @@ impl MapThread<'_> {
                 let refined = mapper.refined();
                 tracing::trace!(keyframe = keyframe.id, ?refined, "poses refined");
                 self.feedback.send(keyframe.id, &refined);
-                (Some(report), refined, report.seeded + report.iterations > 0)
+                (Some(report), refined, report.inserted + report.iterations > 0)
             }
         };
         let cloud = if changed { Some(Arc::new(mapper.download()?)) } else { None };

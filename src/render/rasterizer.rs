@@ -78,7 +78,7 @@ pub struct Rasterizer {
     view: GpuBuffer,
     visible_scan: GpuBuffer,
     intersection_scan: GpuBuffer,
-    pub workspace: Workspace,
+    pub(crate) workspace: Workspace,
 }
 
 /// A view prepared for encoding, and where its sorted intersections will lie.

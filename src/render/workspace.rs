@@ -12,11 +12,11 @@ const UNSAMPLED_MASK_BYTES: u64 = 16_384;
 
 /// Scratch that one rendered view leaves behind for its backward pass. Sizes only grow.
 #[derive(Debug)]
-pub struct Workspace {
-    pub counters: GpuBuffer,
+pub(crate) struct Workspace {
+    pub(crate) counters: GpuBuffer,
     // Per Gaussian.
     pub(crate) capacity: usize,
-    pub projected: GpuBuffer,
+    pub(crate) projected: GpuBuffer,
     pub(super) visible: GpuBuffer,
     pub(super) prefix: GpuBuffer,
     pub(super) block_sums: GpuBuffer,
@@ -24,23 +24,23 @@ pub struct Workspace {
     /// Visible Gaussians, nearest first, in `[0]` after the depth sort.
     pub(super) order: [GpuBuffer; 2],
     /// Per visible Gaussian its intersections, nearest first; then per Gaussian where its slots begin and end; then the visible ones in map order.
-    pub intersection_counts: GpuBuffer,
+    pub(crate) intersection_counts: GpuBuffer,
     pub(super) intersection_offsets: GpuBuffer,
     // Per intersection.
     pub(crate) intersection_capacity: usize,
     pub(super) tile_keys: [GpuBuffer; 2],
-    pub slots: [GpuBuffer; 2],
-    pub slot_gaussians: GpuBuffer,
-    pub intersection_gradients: GpuBuffer,
+    pub(crate) slots: [GpuBuffer; 2],
+    pub(crate) slot_gaussians: GpuBuffer,
+    pub(crate) intersection_gradients: GpuBuffer,
     pub(super) histogram: GpuBuffer,
     // Per image.
     pixels: u32,
     tiles: u32,
-    pub ranges: GpuBuffer,
+    pub(crate) ranges: GpuBuffer,
     /// One bit a tile.
-    pub unsampled: GpuBuffer,
-    pub color_depth: GpuBuffer,
-    pub state: GpuBuffer,
+    pub(crate) unsampled: GpuBuffer,
+    pub(crate) color_depth: GpuBuffer,
+    pub(crate) state: GpuBuffer,
 }
 
 /// Capacities of the scratch buffers.

@@ -11,15 +11,14 @@ use crate::gpu::Gpu;
 use crate::mapping::gaussian_stats::GaussianStats;
 use crate::mapping::keyframe::{KeyframeState, MappedKeyframe};
 use crate::mapping::{Keyframe, MappingConfig};
-use crate::optimise::OptimiserState;
-use crate::render::{Capacities, CloudState, GpuCloud};
+use crate::optimise::TrainerState;
+use crate::render::{CloudState, GpuCloud};
 
 /// Between two keyframes, or between two rounds of a refinement.
 #[derive(Debug, Serialize, Deserialize)]
 pub struct MapperState {
     cloud: CloudState,
-    capacities: Capacities,
-    optimiser: OptimiserState,
+    trainer: TrainerState,
     stats: GaussianStats,
     keyframes: Vec<KeyframeState>,
     rng: u64,
@@ -32,8 +31,7 @@ impl Mapper {
     pub fn state(&self, refinement: Option<&FinalRefinement>) -> Result<MapperState, MappingError> {
         Ok(MapperState {
             cloud: self.cloud.state(&self.gpu)?,
-            capacities: self.rasterizer.capacities(),
-            optimiser: self.optimiser.state(),
+            trainer: self.trainer.state(),
             stats: self.stats.clone(),
             keyframes: self.keyframes.iter().map(|keyframe| keyframe.state(&self.gpu)).collect::<Result<_, _>>()?,
             rng: self.rng.get_seed(),
@@ -49,8 +47,7 @@ impl Mapper {
         if state.stats.histories().len() != mapper.cloud.len() {
             return Err(MappingError::State);
         }
-        mapper.rasterizer.reserve(state.capacities)?;
-        mapper.optimiser.restore(&mapper.gpu, &state.optimiser)?;
+        mapper.trainer.restore(&state.trainer)?;
         mapper.stats = state.stats.clone();
         mapper.rng = Rng::with_seed(state.rng);
         mapper.step_times = state.step_times.clone();
