@@ -14,14 +14,15 @@ const GAUSSIANS: [usize; 4] = [10_000, 110_000, 500_000, 2_000_000];
 const SIZES: [(u32, u32); 3] = [(320, 240), (640, 480), (1200, 680)];
 const DEGREES: [u8; 3] = [0, 1, 3];
 /// Stages that are worth a benchmark of their own; the others are a few percent together.
-const STAGES: [&str; 8] = [
+const STAGES: [&str; 9] = [
     "project_forward",
     "sort_scatter",
     "tile_lists",
     "rasterize_forward",
     "loss_forward",
     "loss_backward",
-    "rasterize_backward",
+    "rasterize_backward_wide",
+    "rasterize_backward_narrow",
     "project_backward_adam",
 ];
 

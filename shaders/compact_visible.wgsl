@@ -7,7 +7,7 @@
 @group(0) @binding(4) var<storage, read_write> depth_keys: array<u32>;
 @group(0) @binding(5) var<storage, read_write> indices: array<u32>;
 // The list in map order goes to its last part; see `tile_lists`.
-@group(0) @binding(6) var<storage, read_write> pair_counts: array<u32>;
+@group(0) @binding(6) var<storage, read_write> intersection_counts: array<u32>;
 
 @compute @workgroup_size(256)
 fn main(
@@ -23,5 +23,5 @@ fn main(
     let to = prefix[i];
     depth_keys[to] = bitcast<u32>(projected[3u * i].z);
     indices[to] = i;
-    pair_counts[3u * view.capacity + to] = i;
+    intersection_counts[3u * view.capacity + to] = i;
 }

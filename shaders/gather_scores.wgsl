@@ -1,10 +1,10 @@
-// Sums the pairs' scores to each visible Gaussian, in order, and adds a view's to those of the views before.
+// Sums the intersections' scores to each visible Gaussian, in order, and adds a view's to those of the views before.
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<storage, read> counters: array<Counter>;
 // See `tile_lists`.
-@group(0) @binding(2) var<storage, read> pair_counts: array<u32>;
-@group(0) @binding(3) var<storage, read> pair_scores: array<vec4<f32>>;
+@group(0) @binding(2) var<storage, read> intersection_counts: array<u32>;
+@group(0) @binding(3) var<storage, read> intersection_scores: array<vec4<f32>>;
 @group(0) @binding(4) var<storage, read> projected: array<vec4<f32>>;
 // [2, capacity], see `GaussianScore`: (wrong pixels, the same times each view's loss, Σ w, largest w); (‖∂‖, ‖Σ|∂|‖ in normalised
 // device coordinates, views that blended it, finest metres per pixel).
@@ -26,18 +26,18 @@ fn main(
     @builtin(local_invocation_index) local: u32,
 ) {
     let item = linear_workgroup(workgroup, workgroups) * 256u + local;
-    // Without room for all pairs nothing was rendered: the step will be repeated.
-    if item >= counters[VISIBLE_COUNTER].count || counters[PAIR_COUNTER].count == 0u {
+    // Without room for all intersections nothing was rendered: the step will be repeated.
+    if item >= counters[VISIBLE_COUNTER].count || counters[INTERSECTION_COUNTER].count == 0u {
         return;
     }
-    let i = pair_counts[3u * view.capacity + item];
-    let end = pair_counts[view.capacity + 2u * i + 1u];
+    let i = intersection_counts[3u * view.capacity + item];
+    let end = intersection_counts[view.capacity + 2u * i + 1u];
     var blended = vec4(0.0);
     var gradient = vec4(0.0);
-    for (var slot = pair_counts[view.capacity + 2u * i]; slot < end; slot++) {
-        let part = pair_scores[slot * 3u];
+    for (var slot = intersection_counts[view.capacity + 2u * i]; slot < end; slot++) {
+        let part = intersection_scores[slot * 3u];
         blended = vec4(blended.xy + part.xy, max(blended.z, part.z), 0.0);
-        gradient += pair_scores[slot * 3u + 1u];
+        gradient += intersection_scores[slot * 3u + 1u];
     }
     if blended.y == 0.0 {
         return;

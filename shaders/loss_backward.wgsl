@@ -10,7 +10,7 @@
 @group(0) @binding(5) var<storage, read> partials: array<vec4<f32>>;
 // [2, H, W] plane 0 (r, g, b, Σ w z), plane 1 (alpha; mean |colour error|, for the scores; -, -).
 @group(0) @binding(6) var<storage, read_write> image_gradients: array<vec4<f32>>;
-@group(0) @binding(7) var<uniform> skipped: SkippedTiles;
+@group(0) @binding(7) var<uniform> unsampled: UnsampledTiles;
 
 // (by mean, by square, by product) of one channel filtered along rows: [26 rows, 16 columns].
 var<workgroup> rows: array<vec4<f32>, 416>;
@@ -24,7 +24,7 @@ fn main(
 ) {
     let tile = 2u * workgroup.y * workgroups.x + workgroup.x;
     let below = select(tile, tile + workgroups.x, workgroup.y * 16u + 8u < setup.height);
-    if is_bit_set(skipped.bits[tile / 128u % 1024u], tile) && is_bit_set(skipped.bits[below / 128u % 1024u], below) {
+    if is_bit_set(unsampled.bits[tile / 128u % 1024u], tile) && is_bit_set(unsampled.bits[below / 128u % 1024u], below) {
         return;
     }
     // Four pixels of one column.

@@ -12,7 +12,7 @@
 @group(0) @binding(5) var<storage, read_write> partials: array<vec4<f32>>;
 // [tiles] sums of |colour error|, SSIM, |depth error|, squared colour error; a tile left out keeps those it had.
 @group(0) @binding(6) var<storage, read_write> loss_sums: array<vec4<f32>>;
-@group(0) @binding(7) var<uniform> skipped: SkippedTiles;
+@group(0) @binding(7) var<uniform> unsampled: UnsampledTiles;
 
 const C1: f32 = 0.0001;
 const C2: f32 = 0.0009;
@@ -37,7 +37,7 @@ fn main(
 ) {
     let first = vec2(workgroup.x * 16u, workgroup.y * 8u);
     let tile = workgroup.y * workgroups.x + workgroup.x;
-    if is_bit_set(skipped.bits[tile / 128u % 1024u], tile) {
+    if is_bit_set(unsampled.bits[tile / 128u % 1024u], tile) {
         clear_partials(first, local);
         return;
     }

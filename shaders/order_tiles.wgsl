@@ -2,7 +2,7 @@
 // to do would idle beside one that has. Neighbours stay together, for they share Gaussians. One workgroup.
 
 @group(0) @binding(0) var<uniform> view: View;
-// [tiles] ranges of pairs; behind them [tiles] (tile, 0).
+// [tiles] ranges of intersections; behind them [tiles] (tile, 0).
 @group(0) @binding(1) var<storage, read_write> ranges: array<vec2<u32>>;
 
 // Filled tiles of each invocation's stretch, then those before it; last, all of them.

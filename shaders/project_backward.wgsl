@@ -1,14 +1,14 @@
-// Carries the pairs' gradients through the projection to each visible Gaussian's parameters, and to the camera pose.
+// Carries the intersections' gradients through the projection to each visible Gaussian's parameters, and to the camera pose.
 //
-// One invocation a visible Gaussian, in map order: neighbours' parameters lie side by side. A Gaussian's pairs do as well, and are summed
+// One invocation a visible Gaussian, in map order: neighbours' parameters lie side by side. A Gaussian's intersections do as well, and are summed
 // in order. `begin_gradient` and `store_gradient` are the sink: it steps Adam at once (`shared/sink_adam.wgsl`) or writes the gradient
 // down (`shared/sink_gradient.wgsl`). The pose gradient is that of the left perturbation T ← Exp(τ)·T of camera_from_world, τ = (ρ, θ).
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<storage, read> counters: array<Counter>;
 // See `tile_lists`.
-@group(0) @binding(2) var<storage, read> pair_counts: array<u32>;
-@group(0) @binding(3) var<storage, read> pair_gradients: array<vec4<f32>>;
+@group(0) @binding(2) var<storage, read> intersection_counts: array<u32>;
+@group(0) @binding(3) var<storage, read> intersection_gradients: array<vec4<f32>>;
 // [workgroups, 2] sums over the workgroup of (∂L/∂ρ, 0), (∂L/∂θ, 0).
 @group(0) @binding(4) var<storage, read_write> pose_sums: array<vec4<f32>>;
 
@@ -29,9 +29,9 @@ fn main(
     let block = linear_workgroup(workgroup, workgroups);
     let item = block * 256u + local;
     var pose = PoseGradient(vec3(0.0), vec3(0.0));
-    // Without room for all pairs nothing was rendered: the step will be repeated.
-    if item < counters[VISIBLE_COUNTER].count && counters[PAIR_COUNTER].count > 0u {
-        pose = backward(pair_counts[3u * view.capacity + item]);
+    // Without room for all intersections nothing was rendered: the step will be repeated.
+    if item < counters[VISIBLE_COUNTER].count && counters[INTERSECTION_COUNTER].count > 0u {
+        pose = backward(intersection_counts[3u * view.capacity + item]);
     }
     rho_sums[local] = pose.rho;
     theta_sums[local] = pose.theta;
@@ -52,11 +52,11 @@ fn backward(i: u32) -> PoseGradient {
     var color_depth = vec4(0.0);
     var first = vec4(0.0);
     var second = vec4(0.0);
-    let end = pair_counts[view.capacity + 2u * i + 1u];
-    for (var slot = pair_counts[view.capacity + 2u * i]; slot < end; slot++) {
-        color_depth += pair_gradients[slot * 3u];
-        first += pair_gradients[slot * 3u + 1u];
-        second += pair_gradients[slot * 3u + 2u];
+    let end = intersection_counts[view.capacity + 2u * i + 1u];
+    for (var slot = intersection_counts[view.capacity + 2u * i]; slot < end; slot++) {
+        color_depth += intersection_gradients[slot * 3u];
+        first += intersection_gradients[slot * 3u + 1u];
+        second += intersection_gradients[slot * 3u + 2u];
     }
     let untouched = all(color_depth == vec4(0.0)) && all(first == vec4(0.0)) && all(second == vec4(0.0));
     if untouched {

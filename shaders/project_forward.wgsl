@@ -1,15 +1,15 @@
-// Projects every Gaussian of the map into a view: image mean, whitening, opacity, colour, depth; and says which can be seen at all.
+// Projects every Gaussian of the map into a view: image mean, conic_factor, opacity, colour, depth; and says which can be seen at all.
 // One invocation a Gaussian. A culled one costs its tests only. Guards are written so that NaN fails them.
 
 @group(0) @binding(0) var<uniform> view: View;
 // [planes, capacity], see `render::GpuCloud`.
 @group(0) @binding(1) var<storage, read> parameters: array<vec4<f32>>;
-// [N, 3]: (mean x, mean y, depth, cut), (whitening xx, xy, yy, opacity),
+// [N, 3]: (mean x, mean y, depth, cut), (conic_factor xx, xy, yy, opacity),
 // (r, g, b, half extents of the ellipse in pixels as two f16).
 @group(0) @binding(2) var<storage, read_write> projected: array<vec4<f32>>;
 // [N] 1 where the Gaussian may touch the image.
 @group(0) @binding(3) var<storage, read_write> visible: array<u32>;
-@group(0) @binding(4) var<uniform> skipped: SkippedTiles;
+@group(0) @binding(4) var<uniform> unsampled: UnsampledTiles;
 
 @compute @workgroup_size(256)
 fn main(
@@ -62,7 +62,7 @@ fn project(i: u32) -> bool {
         return false;
     }
     projected[3u * i] = vec4(mean, depth, cut);
-    projected[3u * i + 1u] = vec4(whitening(projection), opacity);
+    projected[3u * i + 1u] = vec4(conic_factor(projection), opacity);
     projected[3u * i + 2u] = vec4(seen, bitcast<f32>(pack2x16float(min(half_extent * EXTENT_SLACK, vec2(MAX_EXTENT)))));
     return true;
 }
@@ -79,7 +79,7 @@ fn reaches_tile(mean: vec2<f32>, half_extent: vec2<f32>) -> bool {
     for (var y = low.y; y <= high.y; y++) {
         for (var x = low.x; x <= high.x; x++) {
             let tile = y * view.tiles_x + x;
-            if !is_bit_set(skipped.bits[tile / 128u % 1024u], tile) {
+            if !is_bit_set(unsampled.bits[tile / 128u % 1024u], tile) {
                 return true;
             }
         }

@@ -2,7 +2,7 @@
 
 // [H, W] (r, g, b, Σ w z): colour over the background, depth weighted by what was blended.
 @group(0) @binding(5) var<storage, read_write> color_depth: array<vec4<f32>>;
-// [H, W] (transmittance, pairs of the tile's list up to and with the last one blended).
+// [H, W] (transmittance, intersections of the tile's list up to and with the last one blended).
 @group(0) @binding(6) var<storage, read_write> state: array<vec2<f32>>;
 
 var<workgroup> finished: atomic<u32>;
@@ -57,7 +57,7 @@ fn main(
         for (var k = start; k < min(count, start + BATCH); k++) {
             let at = place.member * BATCH + k - start;
             let mean = batch_mean[at];
-            let shape = batch_whitening[at];
+            let shape = batch_conic_factor[at];
             let color = batch_color[at];
             let along = shape.x * (block.x - mean.x);
             for (var s = 0u; s < STRIPS; s++) {

@@ -1,4 +1,4 @@
-// What each (Gaussian, tile) pair does to the pixels that it was really blended into, written over the pair's gradient, whose turn comes
+// What each (Gaussian, tile) intersection does to the pixels that it was really blended into, written over the intersection's gradient, whose turn comes
 // after: the raw material of density control (FastGS, arXiv 2511.04283; absolute gradients after AbsGS, arXiv 2404.10484).
 //
 // A pixel counts as wrong where its error exceeds a multiple of the view's mean error, and the noise of the sensor: one hot pixel
@@ -16,7 +16,7 @@ struct ScoreSetup {
 // (Σ|colour error|, Σ SSIM, -, -) over the view's pixels and channels.
 @group(0) @binding(10) var<uniform> total: vec4<f32>;
 
-// Of a pair, over the pixels of its tile.
+// Of a intersection, over the pixels of its tile.
 struct PairScore {
     // (wrong pixels, Σ w, largest w, 0), w what the Gaussian adds to a pixel.
     seen: vec4<f32>,
@@ -25,7 +25,7 @@ struct PairScore {
 }
 
 const CHUNK: u32 = 8u;
-// [GROUP_TILES, CHUNK, 2, TILE_THREADS] what each invocation adds to each pair of the chunk.
+// [GROUP_TILES, CHUNK, 2, TILE_THREADS] what each invocation adds to each intersection of the chunk.
 var<workgroup> partial: array<vec4<f32>, CHUNK * 2u * THREADS>;
 
 @compute @workgroup_size(THREADS)
@@ -57,7 +57,7 @@ fn main(
             for (var k = chunk; k < chunk_end; k++) {
                 let at = place.member * BATCH + k - start;
                 let mean = batch_mean[at];
-                let shape = batch_whitening[at];
+                let shape = batch_conic_factor[at];
                 let color = batch_color[at];
                 let dx = block.x - mean.x;
                 var sum = PairScore(vec4(0.0), vec4(0.0));
@@ -83,7 +83,7 @@ fn main(
                     sum.z = largest;
                 }
                 let slot = sorted_slots[place.range.x + chunk + item / 2u];
-                pair_gradients[slot * 3u + item % 2u] = sum;
+                intersection_gradients[slot * 3u + item % 2u] = sum;
             }
             workgroupBarrier();
         }

@@ -15,15 +15,15 @@ struct TileListsSetup {
 @group(0) @binding(4) var<storage, read> projected: array<vec4<f32>>;
 // [visible] tiles of each Gaussian, nearest first (mode 0); behind them, from `capacity` on, its first slot and that past its last, in map
 // order (mode 1); and from three times that on, which Gaussians are visible, in map order (`compact_visible`).
-@group(0) @binding(5) var<storage, read_write> pair_counts: array<u32>;
+@group(0) @binding(5) var<storage, read_write> intersection_counts: array<u32>;
 // [visible] where each Gaussian's slots begin, nearest first.
-@group(0) @binding(6) var<storage, read> pair_offsets: array<u32>;
-// [pairs] tile, and the pair's slot, before the tile sort.
+@group(0) @binding(6) var<storage, read> intersection_offsets: array<u32>;
+// [intersections] tile, and the intersection's slot, before the tile sort.
 @group(0) @binding(7) var<storage, read_write> tile_keys: array<u32>;
 @group(0) @binding(8) var<storage, read_write> slots: array<u32>;
-// [pairs] Gaussian of each slot.
+// [intersections] Gaussian of each slot.
 @group(0) @binding(9) var<storage, read_write> slot_gaussians: array<u32>;
-@group(0) @binding(10) var<uniform> skipped: SkippedTiles;
+@group(0) @binding(10) var<uniform> unsampled: UnsampledTiles;
 
 // Slack for rounding, absolute and relative: a tile too many costs time, one too few a seam.
 const SLACK: f32 = 1e-3;
@@ -40,7 +40,7 @@ fn main(
     }
     let gaussian = order[rank];
     let mean_cut = projected[3u * gaussian];
-    let whitening = projected[3u * gaussian + 1u].xyz;
+    let conic_factor = projected[3u * gaussian + 1u].xyz;
     let limit = mean_cut.w * (1.0 + SLACK) + SLACK;
     let mean = mean_cut.xy;
     let half_extent = unpack2x16float(bitcast<u32>(projected[3u * gaussian + 2u].w));
@@ -51,17 +51,17 @@ fn main(
     let high = vec2<u32>(clamp(floor((mean + half_extent) / tile_size), vec2(0.0), last_tile));
     var found = 0u;
     var slot = 0u;
-    let emit = setup.emit == 1u && counters[PAIR_COUNTER].count > 0u;
+    let emit = setup.emit == 1u && counters[INTERSECTION_COUNTER].count > 0u;
     if emit {
-        slot = pair_offsets[rank];
+        slot = intersection_offsets[rank];
     }
     for (var y = low.y; y <= high.y; y++) {
         for (var x = low.x; x <= high.x; x++) {
             let tile = y * view.tiles_x + x;
-            if is_bit_set(skipped.bits[tile / 128u % 1024u], tile) {
+            if is_bit_set(unsampled.bits[tile / 128u % 1024u], tile) {
                 continue;
             }
-            if !touches(mean, whitening, limit, vec2(f32(x), f32(y)) * tile_size, tile_size - 1.0) {
+            if !touches(mean, conic_factor, limit, vec2(f32(x), f32(y)) * tile_size, tile_size - 1.0) {
                 continue;
             }
             if emit {
@@ -73,16 +73,16 @@ fn main(
         }
     }
     if setup.emit == 0u {
-        pair_counts[rank] = found;
+        intersection_counts[rank] = found;
     } else {
-        pair_counts[view.capacity + 2u * gaussian] = slot;
-        pair_counts[view.capacity + 2u * gaussian + 1u] = slot + found;
+        intersection_counts[view.capacity + 2u * gaussian] = slot;
+        intersection_counts[view.capacity + 2u * gaussian + 1u] = slot + found;
     }
 }
 
 // Whether ½dᵀΣ⁻¹d ≤ limit somewhere on the rectangle [first, first + span], d measured from the mean. The form is convex: its minimum
 // is 0 inside, else on one of the two edges that face the mean.
-fn touches(mean: vec2<f32>, whitening: vec3<f32>, limit: f32, first: vec2<f32>, span: vec2<f32>) -> bool {
+fn touches(mean: vec2<f32>, conic_factor: vec3<f32>, limit: f32, first: vec2<f32>, span: vec2<f32>) -> bool {
     let low = first - mean;
     let high = low + span;
     let nearest = clamp(vec2(0.0), low, high);
@@ -91,18 +91,18 @@ fn touches(mean: vec2<f32>, whitening: vec3<f32>, limit: f32, first: vec2<f32>, 
     }
     var smallest = 1e30;
     if nearest.x != 0.0 {
-        let y = -whitening.x * whitening.y * nearest.x / (whitening.y * whitening.y + whitening.z * whitening.z);
-        smallest = min(smallest, form(whitening, vec2(nearest.x, clamp(y, low.y, high.y))));
+        let y = -conic_factor.x * conic_factor.y * nearest.x / (conic_factor.y * conic_factor.y + conic_factor.z * conic_factor.z);
+        smallest = min(smallest, form(conic_factor, vec2(nearest.x, clamp(y, low.y, high.y))));
     }
     if nearest.y != 0.0 {
-        let x = -whitening.y * nearest.y / whitening.x;
-        smallest = min(smallest, form(whitening, vec2(clamp(x, low.x, high.x), nearest.y)));
+        let x = -conic_factor.y * nearest.y / conic_factor.x;
+        smallest = min(smallest, form(conic_factor, vec2(clamp(x, low.x, high.x), nearest.y)));
     }
     return smallest <= limit;
 }
 
-fn form(whitening: vec3<f32>, d: vec2<f32>) -> f32 {
-    let u = whitening.x * d.x + whitening.y * d.y;
-    let v = whitening.z * d.y;
+fn form(conic_factor: vec3<f32>, d: vec2<f32>) -> f32 {
+    let u = conic_factor.x * d.x + conic_factor.y * d.y;
+    let v = conic_factor.z * d.y;
     return u * u + v * v;
 }

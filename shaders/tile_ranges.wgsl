@@ -1,8 +1,8 @@
-// Finds where each tile's pairs begin and end in the sorted list. The ranges are cleared to (0, 0) beforehand.
+// Finds where each tile's intersections begin and end in the sorted list. The ranges are cleared to (0, 0) beforehand.
 
 @group(0) @binding(0) var<storage, read> counters: array<Counter>;
 @group(0) @binding(1) var<storage, read> tile_keys: array<u32>;
-// [tiles] (first pair, past the last).
+// [tiles] (first intersection, past the last).
 @group(0) @binding(2) var<storage, read_write> ranges: array<vec2<u32>>;
 
 @compute @workgroup_size(256)
@@ -12,7 +12,7 @@ fn main(
     @builtin(local_invocation_index) local: u32,
 ) {
     let i = linear_workgroup(workgroup, workgroups) * 256u + local;
-    let count = counters[PAIR_COUNTER].count;
+    let count = counters[INTERSECTION_COUNTER].count;
     if i >= count {
         return;
     }

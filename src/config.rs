@@ -110,8 +110,34 @@ pub enum ConfigError {
     In { path: PathBuf, source: Box<ConfigError> },
 }
 
-/// Dotted keys of earlier versions, and those that replaced them.
-const RENAMED: [(&str, &str); 1] = [("replay.paced", "replay.real_time")];
+/// Dotted keys of earlier versions, and those that replaced them; keys of a section before the section itself.
+const RENAMED: [(&str, &str); 25] = [
+    ("mapping.density.vcd.min_worth", "mapping.density.multi_view.min_contribution"),
+    ("mapping.density.multi_view.min_worth", "mapping.density.multi_view.min_contribution"),
+    ("mapping.density.vcd", "mapping.density.multi_view"),
+    ("mapping.window.last_pace", "mapping.window.final_lr_scale"),
+    ("mapping.adam.position_rate", "mapping.adam.lr_position"),
+    ("mapping.adam.opacity_rate", "mapping.adam.lr_opacity"),
+    ("mapping.adam.scale_rate", "mapping.adam.lr_log_scale"),
+    ("mapping.adam.rotation_rate", "mapping.adam.lr_rotation"),
+    ("mapping.adam.color_rate", "mapping.adam.lr_color"),
+    ("mapping.adam.harmonics_rate", "mapping.adam.lr_harmonics"),
+    ("mapping.adam.averaged_steps", "mapping.adam.ema_steps"),
+    ("mapping.refine.final_position_rate", "mapping.refine.final_lr_scale_position"),
+    ("mapping.refine.final_rate", "mapping.refine.final_lr_scale"),
+    ("mapping.refine_poses.rotation_rate", "mapping.refine_poses.lr_rotation"),
+    ("mapping.refine_poses.translation_rate", "mapping.refine_poses.lr_translation"),
+    ("mapping.plane_sweep.trust", "mapping.plane_sweep.depth_confidence"),
+    ("mapping.skip.tile_share", "mapping.tile_sampling.share"),
+    ("mapping.skip.tile_least", "mapping.tile_sampling.min_share"),
+    ("mapping.skip.tile_noise", "mapping.tile_sampling.noise"),
+    ("mapping.skip.draw_by_loss", "mapping.schedule.draw_by_loss"),
+    ("mapping.skip.coarse_share", "mapping.schedule.coarse_share"),
+    ("mapping.skip.min_gain", "mapping.schedule.min_gain"),
+    ("replay.paced", "replay.real_time"),
+    ("mapping.seeding", "mapping.insertion"),
+    ("mapping.skip", "mapping.schedule"),
+];
 
 /// Refuses keys of earlier versions by their new names.
 fn check_renamed(table: &toml::Table) -> Result<(), ConfigError> {
@@ -196,7 +222,8 @@ impl Config {
             let (key, value) = setting.split_once('=').ok_or_else(|| wrong("write key=value, like mapping.seed=1"))?;
             let value = toml::from_str::<toml::Table>(&format!("v = {value}")).ok().and_then(|mut t| t.remove("v"));
             let value = value.unwrap_or_else(|| toml::Value::String(setting[key.len() + 1..].into()));
-            if let Some((old, new)) = RENAMED.iter().find(|(old, _)| key.trim() == *old) {
+            let is_below = |old: &str| key.trim().strip_prefix(old).is_some_and(|rest| rest.is_empty() || rest.starts_with('.'));
+            if let Some((old, new)) = RENAMED.iter().find(|(old, _)| is_below(old)) {
                 return Err(ConfigError::Renamed { old, new });
             }
             let mut parts: Vec<&str> = key.trim().split('.').collect();
@@ -272,7 +299,7 @@ mod tests {
         assert!(message.contains("run.toml") && message.contains("line 3") && message.contains("ssim_wieght"), "{message}");
         let wrong = |text: &str| toml::from_str::<Config>(text).unwrap().validate().unwrap_err().to_string();
         assert!(wrong("map_scale = 2.0").contains("map_scale"));
-        assert!(wrong("[mapping.seeding]\nstride = 0").contains("stride"));
+        assert!(wrong("[mapping.insertion]\nstride = 0").contains("stride"));
         assert!(wrong("[mapping.adam]\nbeta_1 = 1.0").contains("beta_1"));
     }
 

@@ -43,15 +43,15 @@ impl Preset {
                 mapping.density.every = 5;
                 mapping.density.after_share = 0.0;
                 // In so few steps a tile that is left out once is hardly sampled again.
-                mapping.skip.tile_least = 1.0;
+                mapping.tile_sampling.min_share = 1.0;
             }
             Self::Balanced => {}
             // All tiles gain more than additional steps of the same duration.
             Self::Quality => {
                 mapping.iterations_per_keyframe = 40;
-                mapping.skip.tile_least = 1.0;
-                mapping.seeding.detail = 0.04;
-                mapping.density.vcd.min_worth = 0.5;
+                mapping.tile_sampling.min_share = 1.0;
+                mapping.insertion.detail = 0.04;
+                mapping.density.multi_view.min_contribution = 0.5;
             }
         }
     }

@@ -82,11 +82,11 @@ struct LossSetup {
     // Depth, metres, beyond which the weight falls with its square, as a sensor's precision does.
     precise_depth: f32,
     // Of the view's depth image, 0 to 1.
-    depth_trust: f32,
+    depth_confidence: f32,
 }
 
 // What a residual of depth counts, as a share of `depth_weight`.
 fn depth_precision(measured: f32) -> f32 {
     let ratio = setup.precise_depth / measured;
-    return setup.depth_trust * min(1.0, ratio * ratio);
+    return setup.depth_confidence * min(1.0, ratio * ratio);
 }

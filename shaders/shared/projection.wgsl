@@ -62,7 +62,7 @@ fn project_gaussian(view_: View, mean: vec3<f32>, log_scale: vec3<f32>, unit_rot
 
 // (l_xx, l_xy, l_yy) of d ↦ (l_xx dx + l_xy dy, l_yy dy), whose squared length is ½dᵀΣ⁻¹d: a sum of squares, which cannot turn negative
 // and loses nothing to cancellation where a needle's conic would.
-fn whitening(p: Projection) -> vec3<f32> {
+fn conic_factor(p: Projection) -> vec3<f32> {
     let c = p.covariance;
     let inverse = inverseSqrt(2.0 * c.z);
     return vec3(c.z * inverseSqrt(p.determinant), -c.y * inverseSqrt(p.determinant), 1.0) * inverse;

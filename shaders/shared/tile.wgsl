@@ -3,7 +3,7 @@
 // through workgroup memory.
 
 @group(0) @binding(0) var<uniform> view: View;
-// [tiles] (first pair, past the last) in the sorted list, then [tiles] (tile, 0) in the order of `order_tiles`; [pairs] slot of each sorted pair; [pairs] Gaussian of each slot.
+// [tiles] (first intersection, past the last) in the sorted list, then [tiles] (tile, 0) in the order of `order_tiles`; [intersections] slot of each sorted intersection; [intersections] Gaussian of each slot.
 @group(0) @binding(1) var<storage, read> ranges: array<vec2<u32>>;
 @group(0) @binding(2) var<storage, read> sorted_slots: array<u32>;
 @group(0) @binding(3) var<storage, read> slot_gaussians: array<u32>;
@@ -16,11 +16,11 @@ const THREADS: u32 = TILE_THREADS * GROUP_TILES;
 // Gaussians of each tile held in workgroup memory at a time.
 const BATCH: u32 = 64u;
 var<workgroup> batch_mean: array<vec4<f32>, BATCH * GROUP_TILES>;
-var<workgroup> batch_whitening: array<vec4<f32>, BATCH * GROUP_TILES>;
+var<workgroup> batch_conic_factor: array<vec4<f32>, BATCH * GROUP_TILES>;
 var<workgroup> batch_color: array<vec4<f32>, BATCH * GROUP_TILES>;
 
-// An invocation's place: its tile, the tile's number in the workgroup, its own in the tile, and the tile's pairs in the sorted list. Beyond the last tile
-// there are no pairs and no pixels.
+// An invocation's place: its tile, the tile's number in the workgroup, its own in the tile, and the tile's intersections in the sorted list. Beyond the last tile
+// there are no intersections and no pixels.
 struct Place {
     tile: u32,
     member: u32,
@@ -62,13 +62,13 @@ fn block_of(tile: u32, thread: u32) -> Block {
     return Block(vec4<f32>(columns), f32(y), columns < vec4(view.width), rows, y * view.width + x);
 }
 
-// The members' tiles load up to BATCH of their Gaussians each, from the pair `start` of each one's list on, up to the pair `end`.
+// The members' tiles load up to BATCH of their Gaussians each, from the intersection `start` of each one's list on, up to the intersection `end`.
 fn load_batch(place: Place, start: u32, end: u32) {
     let to = place.member * BATCH;
     for (var k = place.thread; start + k < min(end, start + BATCH); k += TILE_THREADS) {
         let gaussian = slot_gaussians[sorted_slots[place.range.x + start + k]];
         batch_mean[to + k] = projected[3u * gaussian];
-        batch_whitening[to + k] = projected[3u * gaussian + 1u];
+        batch_conic_factor[to + k] = projected[3u * gaussian + 1u];
         batch_color[to + k] = projected[3u * gaussian + 2u];
     }
 }

@@ -8,8 +8,8 @@
 @group(0) @binding(6) var<storage, read> state: array<vec2<f32>>;
 // [2, H, W] gradients of the loss: plane 0 (r, g, b, Σ w z), plane 1 (alpha, |error|, -, -).
 @group(0) @binding(7) var<storage, read> image_gradients: array<vec4<f32>>;
-// [pairs, 3] see `PairGradient`.
-@group(0) @binding(8) var<storage, read_write> pair_gradients: array<vec4<f32>>;
+// [intersections, 3] see `IntersectionGradient`.
+@group(0) @binding(8) var<storage, read_write> intersection_gradients: array<vec4<f32>>;
 
 // How many Gaussians of each tile's list were blended, and the most of these.
 var<workgroup> tile_last: array<atomic<u32>, GROUP_TILES>;
@@ -27,8 +27,8 @@ struct PixelState {
     depth: vec4<f32>,
 }
 
-// Gradient of a pair, q = ∂L/∂log α.
-struct PairGradient {
+// Gradient of a intersection, q = ∂L/∂log α.
+struct IntersectionGradient {
     // (Σ w g_rgb, Σ w g_depth); without the channels that are clamped at black.
     color_depth: vec4<f32>,
     // (Σ q, Σ q dx, Σ q dy, 0)
@@ -104,7 +104,7 @@ fn add_gradient(
     color: vec4<f32>,
     position: u32,
     pixels: ptr<function, PixelState>,
-    sum: ptr<function, PairGradient>,
+    sum: ptr<function, IntersectionGradient>,
 ) {
     let passed = pass_gaussian(shape.x * dx + shape.y * dy, shape.z * dy, mean, shape.w, color, position, pixels);
     let weight = passed.weight;
@@ -121,12 +121,12 @@ fn before_clamp(color: vec4<f32>, gradient: vec4<f32>) -> vec4<f32> {
     return select(vec4(0.0), gradient, vec4(color.xyz > vec3(0.0), true));
 }
 
-// Pairs behind every pixel's last contributor were not blended.
+// Intersections behind every pixel's last contributor were not blended.
 fn clear_unblended(place: Place, blended: u32) {
     for (var i = place.range.x + blended + place.thread; i < place.range.y; i += TILE_THREADS) {
         let slot = sorted_slots[i];
-        pair_gradients[slot * 3u] = vec4(0.0);
-        pair_gradients[slot * 3u + 1u] = vec4(0.0);
-        pair_gradients[slot * 3u + 2u] = vec4(0.0);
+        intersection_gradients[slot * 3u] = vec4(0.0);
+        intersection_gradients[slot * 3u + 1u] = vec4(0.0);
+        intersection_gradients[slot * 3u + 2u] = vec4(0.0);
     }
 }

@@ -21,7 +21,7 @@ struct View {
     gaussian_count: u32,
     capacity: u32,
     sh_degree: u32,
-    pair_capacity: u32,
+    intersection_capacity: u32,
 }
 
 // Workgroups beyond 65,535 are laid out in two dimensions.

@@ -10,8 +10,8 @@ use super::rates::Rates;
 use super::scene::BenchScene;
 use super::work::{Work, count_work};
 use crate::gpu::{Gpu, GpuError};
-use crate::optimise::{AdamConfig, LossConfig, Optimiser, TileSkip, TrainingView};
-use crate::render::{BlendForm, Rasterizer};
+use crate::optimise::{AdamConfig, LossConfig, TileSampling, Trainer, TrainingView};
+use crate::render::BlendForm;
 use crate::splat::ShDegree;
 
 /// What to measure.
@@ -23,8 +23,8 @@ pub struct StepBench {
     pub sh_degree: ShDegree,
     /// Form of the blending passes.
     pub form: BlendForm,
-    /// Tiles that the steps leave out, if any.
-    pub skip: Option<TileSkip>,
+    /// Tile sampling of the steps; `None`: all tiles.
+    pub tile_sampling: Option<TileSampling>,
     /// Timed steps; a few untimed ones precede them.
     pub steps: usize,
 }
@@ -63,10 +63,9 @@ const BATCH: usize = 4;
 pub struct StepRunner {
     gpu: Arc<Gpu>,
     scene: BenchScene,
-    rasterizer: Rasterizer,
-    optimiser: Optimiser,
+    trainer: Trainer,
     still: AdamConfig,
-    skip: Option<TileSkip>,
+    tile_sampling: Option<TileSampling>,
     /// The work in one step.
     pub work: Work,
 }
@@ -84,13 +83,17 @@ pub struct StepTimes {
 
 impl StepRunner {
     /// `gpu` should be opened with [`Gpu::open_profiled`]. Compiles and warms up.
-    pub fn new(gpu: &Arc<Gpu>, scene: BenchScene, form: BlendForm, skip: Option<TileSkip>) -> Result<Self, GpuError> {
-        let mut rasterizer = Rasterizer::with_form(gpu.clone(), form)?;
-        let optimiser = Optimiser::new(&rasterizer)?;
-        let work = count_work(&mut rasterizer, &scene.cloud, &scene.camera)?;
+    pub fn new(
+        gpu: &Arc<Gpu>,
+        scene: BenchScene,
+        form: BlendForm,
+        tile_sampling: Option<TileSampling>,
+    ) -> Result<Self, GpuError> {
+        let mut trainer = Trainer::with_form(gpu.clone(), form)?;
+        let work = count_work(&mut trainer, &scene.cloud, &scene.camera)?;
         // Rates of zero keep the scene as it is, step after step, at the same cost.
         let still = AdamConfig::default().scaled(0.0, 0.0);
-        let mut runner = Self { gpu: gpu.clone(), scene, rasterizer, optimiser, still, skip, work };
+        let mut runner = Self { gpu: gpu.clone(), scene, trainer, still, tile_sampling, work };
         for _ in 0..WARM_UP {
             runner.steps(1)?;
         }
@@ -99,33 +102,32 @@ impl StepRunner {
     }
 
     fn steps(&mut self, count: usize) -> Result<(), GpuError> {
-        let (camera, target, skip) = (self.scene.camera, &self.scene.target, self.skip);
-        let views = [TrainingView { skip, ..TrainingView::new(camera, target) }; BATCH];
-        let configs = (&LossConfig::default(), &self.still);
-        self.optimiser.steps(&mut self.rasterizer, &self.scene.cloud, &views[..count], configs)?;
+        let (camera, target, tile_sampling) = (self.scene.camera, &self.scene.target, self.tile_sampling);
+        let views = [TrainingView { tile_sampling, ..TrainingView::new(camera, target) }; BATCH];
+        self.trainer.steps(&self.scene.cloud, &views[..count], &LossConfig::default(), &self.still)?;
         Ok(())
     }
 
     /// Runs a batch of steps and waits for them.
     pub fn run(&mut self) -> Result<StepTimes, GpuError> {
         let share = BATCH as u32;
-        let encoded = self.optimiser.encode_time();
+        let encoded = self.trainer.encode_time();
         let started = Instant::now();
         self.steps(BATCH)?;
         let wall = started.elapsed() / share;
-        let encoding = (self.optimiser.encode_time() - encoded) / share;
+        let encoding = (self.trainer.encode_time() - encoded) / share;
         let mut stages = BTreeMap::<_, Duration>::new();
         for (label, ms) in self.gpu.take_profile()?.unwrap_or_default() {
             *stages.entry(label).or_default() += Duration::from_secs_f64(ms * 1e-3 / f64::from(share));
         }
-        stages.remove(Optimiser::END_MARK);
+        stages.remove(Trainer::END_MARK);
         Ok(StepTimes { wall, encoding, stages })
     }
 }
 
 /// Measures a training step on a scene.
 pub fn bench_step(gpu: &Arc<Gpu>, scene: BenchScene, bench: &StepBench, rates: &Rates) -> Result<StepReport, GpuError> {
-    let mut runner = StepRunner::new(gpu, scene, bench.form, bench.skip)?;
+    let mut runner = StepRunner::new(gpu, scene, bench.form, bench.tile_sampling)?;
     let times = (0..bench.steps.div_ceil(BATCH)).map(|_| runner.run()).collect::<Result<Vec<_>, _>>()?;
     let ms = |part: &dyn Fn(&StepTimes) -> Duration| {
         let mut all: Vec<f64> = times.iter().map(|t| part(t).as_secs_f64() * 1e3).collect();
@@ -161,7 +163,7 @@ pub fn bench_step(gpu: &Arc<Gpu>, scene: BenchScene, bench: &StepBench, rates: &
 /// the shaders (an exponential as 8, a division as 4).
 fn floors(work: &Work, bench: &StepBench, rates: &Rates) -> BTreeMap<&'static str, f64> {
     let coefficients = bench.sh_degree.coefficients() as f64;
-    let [n, visible, pairs, pixels] = [work.gaussians, work.visible, work.pairs, work.pixels].map(|v| v as f64);
+    let [n, visible, intersections, pixels] = [work.gaussians, work.visible, work.intersections, work.pixels].map(|v| v as f64);
     let (evaluations, blended, back) = (work.evaluations as f64, work.blended as f64, work.backward_evaluations as f64);
     let floor = |bytes: f64, flops: f64| 1e3 * (bytes / rates.bytes_per_s).max(flops / rates.flops_per_s);
     let (depth_passes, tile_passes) = (4.0, if work.tiles < 256 { 1.0 } else { 2.0 });
@@ -170,14 +172,14 @@ fn floors(work: &Work, bench: &StepBench, rates: &Rates) -> BTreeMap<&'static st
     let taps = 2.0 * 2.0 * 11.0 * 3.0 * pixels;
     BTreeMap::from([
         ("project_forward", floor(n * (16.0 * (2.0 + coefficients) + 20.0) + visible * 64.0, n * 150.0)),
-        ("sort_count_digits", floor(4.0 * (depth_passes * visible + tile_passes * pairs), 0.0)),
-        ("sort_scatter", floor(16.0 * (depth_passes * visible + tile_passes * pairs), 0.0)),
-        ("tile_lists", floor(visible * 2.0 * 40.0 + pairs * 12.0, 2.0 * pairs * 40.0)),
-        ("tile_ranges", floor(pairs * 4.0, 0.0)),
-        ("rasterize_forward", floor(pairs * 56.0 + pixels * 24.0, evaluations * 11.0 + blended * 24.0)),
+        ("sort_count_digits", floor(4.0 * (depth_passes * visible + tile_passes * intersections), 0.0)),
+        ("sort_scatter", floor(16.0 * (depth_passes * visible + tile_passes * intersections), 0.0)),
+        ("tile_lists", floor(visible * 2.0 * 40.0 + intersections * 12.0, 2.0 * intersections * 40.0)),
+        ("tile_ranges", floor(intersections * 4.0, 0.0)),
+        ("rasterize_forward", floor(intersections * 56.0 + pixels * 24.0, evaluations * 11.0 + blended * 24.0)),
         ("loss_forward", floor(pixels * (20.0 + 48.0 + 12.0), taps * 5.0)),
         ("loss_backward", floor(pixels * (20.0 + 48.0 + 12.0 + 32.0), taps * 3.0)),
-        ("rasterize_backward", floor(pairs * 104.0 + pixels * 56.0, back * 11.0 + blended * 70.0)),
-        ("project_backward_adam", floor(pairs * 48.0 + visible * planes * 16.0 * 6.0, visible * (400.0 + planes * 60.0))),
+        (bench.form.backward_stage(), floor(intersections * 104.0 + pixels * 56.0, back * 11.0 + blended * 70.0)),
+        ("project_backward_adam", floor(intersections * 48.0 + visible * planes * 16.0 * 6.0, visible * (400.0 + planes * 60.0))),
     ])
 }

@@ -1,11 +1,12 @@
-//! How much work a view really is: pairs, evaluations, blended evaluations, counted from the buffers that the GPU left.
+//! How much work a view really is: tile intersections, evaluations, blended evaluations, counted from the buffers that the GPU left.
 
 use rayon::prelude::*;
 use serde::Serialize;
 
 use crate::gpu::GpuError;
+use crate::optimise::Trainer;
 use crate::render::layout::{TILE_HEIGHT, TILE_WIDTH};
-use crate::render::{GpuCloud, Rasterizer, ViewCounts};
+use crate::render::{GpuCloud, ViewCounts};
 use crate::splat::model::{ALPHA_MAX, TRANSMITTANCE_MIN, ViewCamera};
 
 /// Counted work of one view.
@@ -13,7 +14,7 @@ use crate::splat::model::{ALPHA_MAX, TRANSMITTANCE_MIN, ViewCamera};
 pub struct Work {
     pub gaussians: u64,
     pub visible: u64,
-    pub pairs: u64,
+    pub intersections: u64,
     /// (Gaussian, pixel) pairs whose exponent is computed in the forward pass: a tile's Gaussians times its pixels, until all its
     /// pixels are finished.
     pub evaluations: u64,
@@ -33,7 +34,8 @@ struct TileWork {
 }
 
 /// Renders the view once more and counts.
-pub fn count_work(rasterizer: &mut Rasterizer, cloud: &GpuCloud, camera: &ViewCamera) -> Result<Work, GpuError> {
+pub fn count_work(trainer: &mut Trainer, cloud: &GpuCloud, camera: &ViewCamera) -> Result<Work, GpuError> {
+    let rasterizer = trainer.rasterizer_mut();
     let rendered = rasterizer.render(cloud, camera, [0.0; 3])?;
     let counts: ViewCounts = rasterizer.finish()?.unwrap_or_default();
     let gpu = rasterizer.gpu().clone();
@@ -43,11 +45,11 @@ pub fn count_work(rasterizer: &mut Rasterizer, cloud: &GpuCloud, camera: &ViewCa
     let sorted = rasterizer.prepare(cloud, camera, [0.0; 3])?.sorted;
     let ws = &rasterizer.workspace;
     let ranges: Vec<[u32; 2]> = ws.ranges.read(&gpu, 0, tiles as usize)?;
-    let slots: Vec<u32> = ws.slots[sorted].read(&gpu, 0, counts.pairs as usize)?;
-    let slot_gaussians: Vec<u32> = ws.slot_gaussians.read(&gpu, 0, counts.pairs as usize)?;
+    let slots: Vec<u32> = ws.slots[sorted].read(&gpu, 0, counts.intersections as usize)?;
+    let slot_gaussians: Vec<u32> = ws.slot_gaussians.read(&gpu, 0, counts.intersections as usize)?;
     let projected: Vec<[[f32; 4]; 3]> = ws.projected.read(&gpu, 0, cloud.len())?;
-    let splat = |pair: u32| {
-        let gaussian = slot_gaussians[slots[pair as usize] as usize] as usize;
+    let splat = |intersection: u32| {
+        let gaussian = slot_gaussians[slots[intersection as usize] as usize] as usize;
         (projected[gaussian][0], projected[gaussian][1])
     };
     let per_tile: Vec<TileWork> = (0..tiles)
@@ -63,7 +65,7 @@ pub fn count_work(rasterizer: &mut Rasterizer, cloud: &GpuCloud, camera: &ViewCa
     Ok(Work {
         gaussians: cloud.len() as u64,
         visible: u64::from(counts.visible),
-        pairs: u64::from(counts.pairs),
+        intersections: u64::from(counts.intersections),
         evaluations: sum(|t| t.evaluations),
         blended: sum(|t| t.blended),
         backward_evaluations: sum(|t| t.backward_evaluations),
@@ -77,24 +79,24 @@ fn tile_work([first, end]: [u32; 2], pixels: &[(u32, u32)], splat: &dyn Fn(u32) 
     let mut transmittance = vec![1.0f32; pixels.len()];
     let mut finished = vec![false; pixels.len()];
     let mut last = first;
-    for pair in first..end {
+    for intersection in first..end {
         // The GPU looks for finished tiles once per batch.
-        if (pair - first) % 64 == 0 && finished.iter().all(|f| *f) {
+        if (intersection - first) % 64 == 0 && finished.iter().all(|f| *f) {
             break;
         }
-        let (mean, whitening) = splat(pair);
+        let (mean, conic_factor) = splat(intersection);
         work.evaluations += pixels.len() as u64;
         for (i, &(x, y)) in pixels.iter().enumerate() {
             if finished[i] {
                 continue;
             }
             let (dx, dy) = (x as f32 - mean[0], y as f32 - mean[1]);
-            let (u, v) = (whitening[0] * dx + whitening[1] * dy, whitening[2] * dy);
+            let (u, v) = (conic_factor[0] * dx + conic_factor[1] * dy, conic_factor[2] * dy);
             let distance = u * u + v * v;
             if distance > mean[3] {
                 continue;
             }
-            let alpha = (whitening[3] * (-distance).exp()).min(ALPHA_MAX as f32);
+            let alpha = (conic_factor[3] * (-distance).exp()).min(ALPHA_MAX as f32);
             let next = transmittance[i] * (1.0 - alpha);
             if next < TRANSMITTANCE_MIN as f32 {
                 finished[i] = true;
@@ -102,7 +104,7 @@ fn tile_work([first, end]: [u32; 2], pixels: &[(u32, u32)], splat: &dyn Fn(u32) 
             }
             transmittance[i] = next;
             work.blended += 1;
-            last = pair + 1;
+            last = intersection + 1;
         }
     }
     work.backward_evaluations = u64::from(last - first) * pixels.len() as u64;

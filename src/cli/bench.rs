@@ -10,7 +10,7 @@ use keysplat::bench::{BenchScene, Rates, StepBench, StepReport, bench_step, meas
 use keysplat::export::MapFormat;
 use keysplat::geometry::{Pinhole, Se3, Trajectory};
 use keysplat::gpu::{AdapterSummary, Gpu, GpuError};
-use keysplat::optimise::TileSkip;
+use keysplat::optimise::TileSampling;
 use keysplat::render::BlendForm;
 use keysplat::run_folder::outputs;
 use keysplat::sequence::{RectifiedImage, Rectifier};
@@ -56,7 +56,7 @@ struct StepArgs {
     /// Form of the blending passes: the adapter's own by default.
     #[arg(long, value_enum)]
     form: Option<Form>,
-    /// Leave tiles out as `mapping.skip.tile_share` does, with a tenth as the least.
+    /// Sample tiles as `mapping.tile_sampling.share` does, with a least share of a tenth.
     #[arg(long)]
     tile_share: Option<f32>,
     /// Timed steps per scene.
@@ -119,7 +119,7 @@ pub fn bench(args: &BenchArgs, verbosity: Verbosity) -> miette::Result<()> {
 fn step(args: &StepArgs) -> miette::Result<()> {
     let gpu = Gpu::open_profiled(args.adapter.as_deref()).into_diagnostic()?;
     let rates = measure_rates(&gpu).into_diagnostic()?;
-    let skip = args.tile_share.map(|share| TileSkip { share, least: 0.1, noise: 0.0 });
+    let tile_sampling = args.tile_share.map(|share| TileSampling { share, min_share: 0.1, noise: 0.0 });
     let form = args.form.map_or(BlendForm::of(&gpu), BlendForm::from);
     let mut report = Report {
         adapter: gpu.adapter.clone(),
@@ -159,14 +159,17 @@ fn step(args: &StepArgs) -> miette::Result<()> {
             let depth = view.image.depth.as_ref().map(|depth| depth.metres.as_slice());
             let scene = BenchScene::of_map(&gpu, &cloud, camera, (&view.image.color, depth));
             let sh_degree = cloud.sh_degree;
-            measure(scene, StepBench { gaussians: cloud.len(), width, height, sh_degree, form, skip, steps: args.steps })?;
+            measure(
+                scene,
+                StepBench { gaussians: cloud.len(), width, height, sh_degree, form, tile_sampling, steps: args.steps },
+            )?;
             continue;
         }
         for &(width, height) in &args.size {
             for &degree in &args.sh {
                 let sh_degree = ShDegree::new(degree).ok_or_else(|| miette!("--sh takes degrees 0 to 3, not {degree}"))?;
                 let scene = BenchScene::new(&gpu, gaussians, (width, height), sh_degree);
-                measure(scene, StepBench { gaussians, width, height, sh_degree, form, skip, steps: args.steps })?;
+                measure(scene, StepBench { gaussians, width, height, sh_degree, form, tile_sampling, steps: args.steps })?;
             }
         }
     }
@@ -206,7 +209,10 @@ fn print(r: &StepReport) {
     let b = &r.bench;
     println!("\n{} Gaussians, {}x{}, SH {}", b.gaussians, b.width, b.height, b.sh_degree.get());
     let w = &r.work;
-    println!("  visible {}   pairs {}   evaluations {}   blended {}", w.visible, w.pairs, w.evaluations, w.blended);
+    println!(
+        "  visible {}   intersections {}   evaluations {}   blended {}",
+        w.visible, w.intersections, w.evaluations, w.blended
+    );
     for stage in &r.stages {
         println!("  {:<24}{:>9.3} ms   floor {:>8.3} ms", stage.stage, stage.ms, stage.floor_ms);
     }

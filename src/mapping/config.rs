@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::{DensityConfig, ExposureConfig, LimitsConfig, PlaneSweepConfig, RefinePosesConfig};
-use crate::optimise::{AdamConfig, LossConfig, TileSkip};
+use crate::optimise::{AdamConfig, LossConfig, TileSampling};
 use crate::splat::ShDegree;
 
 /// The mapper's configuration.
@@ -22,11 +22,12 @@ pub struct MappingConfig {
     /// Seed of the draws among keyframes.
     pub seed: u64,
     pub window: WindowConfig,
-    pub skip: SkipConfig,
+    pub schedule: ScheduleConfig,
+    pub tile_sampling: TileSamplingConfig,
     pub limits: LimitsConfig,
     pub refine_poses: RefinePosesConfig,
     pub exposure: ExposureConfig,
-    pub seeding: SeedingConfig,
+    pub insertion: InsertionConfig,
     pub plane_sweep: PlaneSweepConfig,
     pub points: PointsConfig,
     pub refine: RefineConfig,
@@ -44,11 +45,12 @@ impl Default for MappingConfig {
             yields_to_keyframes: false,
             seed: 0,
             window: WindowConfig::default(),
-            skip: SkipConfig::default(),
+            schedule: ScheduleConfig::default(),
+            tile_sampling: TileSamplingConfig::default(),
             limits: LimitsConfig::default(),
             refine_poses: RefinePosesConfig::default(),
             exposure: ExposureConfig::default(),
-            seeding: SeedingConfig::default(),
+            insertion: InsertionConfig::default(),
             plane_sweep: PlaneSweepConfig::default(),
             points: PointsConfig::default(),
             refine: RefineConfig::default(),
@@ -71,53 +73,64 @@ pub struct WindowConfig {
     pub older_share: f32,
     /// After each keyframe Adam's step sizes fall evenly to this share of themselves: new Gaussians move fast, and the map has settled
     /// when the next keyframe comes.
-    pub last_pace: f32,
+    pub final_lr_scale: f32,
 }
 
 impl Default for WindowConfig {
     fn default() -> Self {
-        Self { recent: 6, covisible: 3, older_share: 0.6, last_pace: 1.0 }
+        Self { recent: 6, covisible: 3, older_share: 0.6, final_lr_scale: 1.0 }
     }
 }
 
-/// Work that is left out where little is to be gained.
+/// Which steps follow a keyframe: their views, sizes and number.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-pub struct SkipConfig {
-    /// Older keyframes are drawn in proportion to their loss, not evenly.
+pub struct ScheduleConfig {
+    /// Older keyframes are drawn in proportion to their loss, not uniformly.
     pub draw_by_loss: bool,
-    /// The first steps after a keyframe, this share of them, are taken at half the size.
+    /// Share of the steps after a keyframe, the first ones, that use images of half the size.
     pub coarse_share: f32,
     /// The steps after a keyframe end when ten of them lower the loss of their views by less than this share; 0: never.
     pub min_gain: f32,
-    /// A tile whose loss is its view's mean is worked on in this share of the view's steps, one of more or less loss in proportion more
-    /// or less often; 1 and `tile_least` 1: all tiles in all steps.
-    pub tile_share: f32,
-    /// Least share of the steps that a tile is worked on.
-    pub tile_least: f32,
-    /// Loss per pixel below which a tile is worked on no more often than that.
-    pub tile_noise: f32,
 }
 
-impl SkipConfig {
-    /// Which tiles the steps leave out, if any.
-    pub fn tiles(&self) -> Option<TileSkip> {
-        let Self { tile_share: share, tile_least: least, tile_noise: noise, .. } = *self;
-        (least < 1.0).then_some(TileSkip { share, least, noise })
+impl Default for ScheduleConfig {
+    fn default() -> Self {
+        Self { draw_by_loss: true, coarse_share: 0.0, min_gain: 0.01 }
     }
 }
 
-impl Default for SkipConfig {
+/// Stochastic tile sampling: which tiles of a view a step uses.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct TileSamplingConfig {
+    /// Share of a view's steps that sample a tile of mean loss; other tiles in proportion to their loss.
+    pub share: f32,
+    /// Least share of the steps that sample a tile; 1: every step uses all tiles.
+    pub min_share: f32,
+    /// Loss per pixel below which a tile is sampled in no more than the least share.
+    pub noise: f32,
+}
+
+impl TileSamplingConfig {
+    /// The sampling of each step; `None` if steps use all tiles.
+    pub fn sampling(&self) -> Option<TileSampling> {
+        let Self { share, min_share, noise } = *self;
+        (min_share < 1.0).then_some(TileSampling { share, min_share, noise })
+    }
+}
+
+impl Default for TileSamplingConfig {
     fn default() -> Self {
-        Self { draw_by_loss: true, coarse_share: 0.0, min_gain: 0.01, tile_share: 0.7, tile_least: 0.1, tile_noise: 0.0 }
+        Self { share: 0.7, min_share: 0.1, noise: 0.0 }
     }
 }
 
 /// Where a keyframe adds Gaussians.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-pub struct SeedingConfig {
-    /// One seed per `stride`² pixels where the image has most detail, and per `flat_stride`² where it is flat.
+pub struct InsertionConfig {
+    /// One Gaussian per `stride`² pixels where the image has most detail, and per `flat_stride`² where it is flat.
     pub stride: u32,
     pub flat_stride: u32,
     /// Standard deviation of a block's colours (0 to 1) above which the block is quartered.
@@ -129,18 +142,18 @@ pub struct SeedingConfig {
     /// A block whose brightness differs from its surroundings by this much more in the image than in the render, or less, misses detail;
     /// 0 to 1, 1: none does.
     pub missed_detail: f32,
-    /// Standard deviation of a seed in units of its spacing on the surface.
+    /// Standard deviation of a new Gaussian in units of its spacing on the surface.
     pub footprint: f32,
-    /// Standard deviation of a seed across its surface in units of that along it.
+    /// Standard deviation of a new Gaussian across its surface in units of that along it.
     pub thickness: f32,
-    /// Opacity of a seed.
+    /// Opacity of a new Gaussian.
     pub opacity: f32,
-    /// No seed nearer to the camera or farther than this, metres.
+    /// No Gaussian is inserted nearer to the camera or farther than this, metres.
     pub min_depth_metres: f32,
     pub max_depth_metres: f32,
 }
 
-impl Default for SeedingConfig {
+impl Default for InsertionConfig {
     fn default() -> Self {
         Self {
             stride: 2,
@@ -192,8 +205,8 @@ pub struct RefineConfig {
     /// Share of the steps, the first ones, that see the images at half size.
     pub half_size_share: f32,
     /// What the rates of positions, and all others, fall to in the end, as a share of what they are at first.
-    pub final_position_rate: f32,
-    pub final_rate: f32,
+    pub final_lr_scale_position: f32,
+    pub final_lr_scale: f32,
 }
 
 impl Default for RefineConfig {
@@ -204,8 +217,8 @@ impl Default for RefineConfig {
             density_views: 10,
             growth_share: 0.65,
             half_size_share: 0.3,
-            final_position_rate: 0.02,
-            final_rate: 0.2,
+            final_lr_scale_position: 0.02,
+            final_lr_scale: 0.2,
         }
     }
 }
@@ -214,12 +227,12 @@ impl MappingConfig {
     /// For recordings whose poses are known: keyframes only arrive, and the refinement makes the map.
     pub fn offline() -> Self {
         let refine = RefineConfig { steps: 6000, ..RefineConfig::default() };
-        // Points and seeds lie further from where they belong than those of a depth image do. The refinement lets all rates fall by itself,
+        // Points and inserted Gaussians lie further from where they belong than those of a depth image do. The refinement lets all rates fall by itself,
         // which leaves averages nothing but to lag behind.
-        let adam = AdamConfig { position_rate: 0.16, color_settling_steps: 0.0, averaged_steps: 1.0, ..AdamConfig::default() };
-        // No keyframe seeds anything during the refinement: what the first Gaussians miss must grow out of them.
+        let adam = AdamConfig { lr_position: 0.16, color_settling_steps: 0.0, ema_steps: 1.0, ..AdamConfig::default() };
+        // No keyframe inserts anything during the refinement: what the first Gaussians miss must grow out of them.
         let mut density = DensityConfig::default();
-        density.vcd.max_growth = 0.15;
+        density.multi_view.max_growth = 0.15;
         Self { iterations_per_keyframe: 0, first_iterations: 0, refine, adam, density, ..Self::default() }
     }
 
@@ -228,8 +241,8 @@ impl MappingConfig {
         let mut scaled = self.clone();
         let lengths = [
             &mut scaled.density.max_scale_metres,
-            &mut scaled.seeding.min_depth_metres,
-            &mut scaled.seeding.max_depth_metres,
+            &mut scaled.insertion.min_depth_metres,
+            &mut scaled.insertion.max_depth_metres,
             &mut scaled.loss.precise_depth_metres,
         ];
         lengths.into_iter().for_each(|length| *length *= units_per_metre);
@@ -239,24 +252,24 @@ impl MappingConfig {
 
     /// Whether any step may be taken at half the size.
     pub fn learns_at_half_size(&self) -> bool {
-        self.skip.coarse_share > 0.0 || (self.refine.steps > 0 && self.refine.half_size_share > 0.0)
+        self.schedule.coarse_share > 0.0 || (self.refine.steps > 0 && self.refine.half_size_share > 0.0)
     }
 
     /// Says what is wrong with the values, if anything.
     pub fn validate(&self) -> Result<(), String> {
-        let s = &self.seeding;
+        let s = &self.insertion;
         if !(s.stride.is_power_of_two() && s.flat_stride.is_power_of_two() && s.stride <= s.flat_stride && s.flat_stride <= 64) {
             return Err(
-                "mapping.seeding.stride and flat_stride must be powers of two up to 64, flat_stride the larger one".into()
+                "mapping.insertion.stride and flat_stride must be powers of two up to 64, flat_stride the larger one".into()
             );
         }
         let shares = [
             ("window.older_share", self.window.older_share),
-            ("skip.coarse_share", self.skip.coarse_share),
-            ("skip.min_gain", self.skip.min_gain),
-            ("seeding.min_alpha", s.min_alpha),
-            ("seeding.opacity", s.opacity),
-            ("seeding.detail", s.detail),
+            ("schedule.coarse_share", self.schedule.coarse_share),
+            ("schedule.min_gain", self.schedule.min_gain),
+            ("insertion.min_alpha", s.min_alpha),
+            ("insertion.opacity", s.opacity),
+            ("insertion.detail", s.detail),
             ("points.opacity", self.points.opacity),
         ];
         if let Some((name, value)) = shares.iter().find(|(_, value)| !(0.0..1.0).contains(value)) {
@@ -267,15 +280,15 @@ impl MappingConfig {
             ("points.spacing_pixels", self.points.spacing_pixels),
             ("points.footprint", self.points.footprint),
             ("points.size_range", self.points.size_range),
-            ("refine.final_position_rate", self.refine.final_position_rate),
-            ("refine.final_rate", self.refine.final_rate),
-            ("seeding.depth_disagreement", s.depth_disagreement),
-            ("seeding.missed_detail", s.missed_detail),
-            ("seeding.footprint", s.footprint),
-            ("seeding.thickness", s.thickness),
-            ("seeding.opacity", s.opacity),
-            ("seeding.min_depth_metres", s.min_depth_metres),
-            ("seeding.max_depth_metres", s.max_depth_metres),
+            ("refine.final_lr_scale_position", self.refine.final_lr_scale_position),
+            ("refine.final_lr_scale", self.refine.final_lr_scale),
+            ("insertion.depth_disagreement", s.depth_disagreement),
+            ("insertion.missed_detail", s.missed_detail),
+            ("insertion.footprint", s.footprint),
+            ("insertion.thickness", s.thickness),
+            ("insertion.opacity", s.opacity),
+            ("insertion.min_depth_metres", s.min_depth_metres),
+            ("insertion.max_depth_metres", s.max_depth_metres),
         ];
         if let Some((name, value)) = positive.iter().find(|(_, value)| !(value.is_finite() && *value > 0.0)) {
             return Err(format!("mapping.{name} must be positive, not {value}"));

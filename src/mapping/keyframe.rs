@@ -5,17 +5,15 @@ use std::borrow::Cow;
 use image::{GrayImage, Rgb, RgbImage};
 use serde::{Deserialize, Serialize};
 
+use super::KeyframeId;
 use super::exposure;
 use super::plane_sweep::{self, SourceView};
-use super::refine_poses::{RefinePosesConfig, Refinement, median_depth};
+use super::refine_poses::{PoseRefinement, RefinePosesConfig};
 use crate::geometry::{Pinhole, Se3};
 use crate::gpu::{Gpu, GpuError, plain};
 use crate::optimise::{TargetImage, TrainingView};
 use crate::sequence::{DepthImage, RectifiedImage};
 use crate::splat::{Exposure, ViewCamera};
-
-/// The tracker's number of a keyframe.
-pub type KeyframeId = usize;
 
 /// What arrives.
 #[derive(Clone, Debug)]
@@ -60,10 +58,10 @@ pub(super) struct MappedKeyframe {
     pub camera: ViewCamera,
     /// The tracker's camera_from_world, which the refinement goes out from.
     pub tracked_from_world: Se3,
-    pub refinement: Refinement,
+    pub refinement: PoseRefinement,
     /// Of the recorded image against the map; the image that is kept is corrected.
     pub exposure: Exposure,
-    /// Median of the measured depths.
+    /// Median of the measured depths, metres; 1 if there are none.
     pub depth_metres: f64,
     /// Until it is given back.
     image: Option<Images>,
@@ -88,7 +86,7 @@ pub(super) struct KeyframeState {
     pub id: KeyframeId,
     camera: ViewCamera,
     tracked_from_world: Se3,
-    refinement: Refinement,
+    refinement: PoseRefinement,
     exposure: Exposure,
     depth_metres: f64,
     covisible: Vec<KeyframeId>,
@@ -145,9 +143,9 @@ impl MappedKeyframe {
             id: keyframe.id,
             camera,
             tracked_from_world: camera.camera_from_world,
-            refinement: Refinement::default(),
+            refinement: PoseRefinement::default(),
             exposure,
-            depth_metres: median_depth(image),
+            depth_metres: image.median_depth_metres().unwrap_or(1.0),
             image: Some(Images::new(gpu, image, with_half)?),
             gray: matches!(keyframe.depth_source, DepthSource::Landmarks { .. }).then(|| plane_sweep::gray(&image.color)),
             covisible: keyframe.covisible.clone(),
@@ -214,9 +212,9 @@ impl MappedKeyframe {
         self.camera.camera_from_world = self.refinement.refined_from_tracked * tracked_from_world;
     }
 
-    /// Follows the images by one step, see [`Refinement::step`].
-    pub fn refine(&mut self, gradient: &[f32; 6], pace: f32, config: &RefinePosesConfig) {
-        self.refinement.step(gradient, pace, config);
+    /// Follows the images by one step, see [`PoseRefinement::step`].
+    pub fn refine(&mut self, gradient: &[f32; 6], lr_scale: f32, config: &RefinePosesConfig) {
+        self.refinement.step(gradient, lr_scale, config);
         self.track(self.tracked_from_world);
     }
 

@@ -3,8 +3,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::gaussian_stats::GaussianHistory;
 use super::keyframe::MappedKeyframe;
-use super::ledger::Entry;
 
 /// Bytes that the rasterizer's scratch and the scores take for each Gaussian.
 const SCRATCH_BYTES_EACH: u64 = 124;
@@ -15,8 +15,8 @@ const IMAGES_SHARE: f64 = 0.4;
 /// At least this many Gaussians are always allowed: less is no map.
 const LEAST_GAUSSIANS: usize = 1000;
 const LEAST_KEYFRAMES: usize = 8;
-/// Seeds of one keyframe may take at most this share of all places.
-const SEEDS_SHARE: f64 = 0.5;
+/// New Gaussians of one keyframe may take at most this share of all places.
+const INSERTED_SHARE: f64 = 0.5;
 
 /// What the mapper may use.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -75,15 +75,15 @@ impl LimitsConfig {
     }
 }
 
-/// How many of `seeds` may come into a map of at most `most` Gaussians.
-pub(super) fn seeds_allowed(seeds: usize, most: usize) -> usize {
-    seeds.min((SEEDS_SHARE * most as f64) as usize)
+/// How many of `inserted` new Gaussians may come into a map of at most `most` Gaussians.
+pub(super) fn insertions_allowed(inserted: usize, most: usize) -> usize {
+    inserted.min((INSERTED_SHARE * most as f64) as usize)
 }
 
 /// The Gaussians to keep so that at most `most` are left: the least useful go, the older first among equals. Ascending.
-pub(super) fn most_useful(entries: &[Entry], most: usize) -> Vec<u32> {
-    let mut ranked: Vec<u32> = (0..entries.len() as u32).collect();
-    ranked.sort_by(|a, b| entries[*b as usize].worth.total_cmp(&entries[*a as usize].worth).then(b.cmp(a)));
+pub(super) fn most_useful(histories: &[GaussianHistory], most: usize) -> Vec<u32> {
+    let mut ranked: Vec<u32> = (0..histories.len() as u32).collect();
+    ranked.sort_by(|a, b| histories[*b as usize].contribution.total_cmp(&histories[*a as usize].contribution).then(b.cmp(a)));
     ranked.truncate(most);
     ranked.sort_unstable();
     ranked
@@ -108,10 +108,11 @@ mod tests {
 
     #[test]
     fn the_least_useful_go_first() {
-        let entries = [0.3, 0.0, 2.0, 0.0, 0.1].map(|worth| Entry { worth, ..Entry::default() });
-        assert_eq!(most_useful(&entries, 4), [0, 2, 3, 4]);
-        assert_eq!(most_useful(&entries, 2), [0, 2]);
-        assert_eq!(most_useful(&entries, 9), [0, 1, 2, 3, 4]);
+        let histories =
+            [0.3, 0.0, 2.0, 0.0, 0.1].map(|contribution| GaussianHistory { contribution, ..GaussianHistory::default() });
+        assert_eq!(most_useful(&histories, 4), [0, 2, 3, 4]);
+        assert_eq!(most_useful(&histories, 2), [0, 2]);
+        assert_eq!(most_useful(&histories, 9), [0, 1, 2, 3, 4]);
     }
 
     #[test]

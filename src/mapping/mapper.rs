@@ -13,20 +13,23 @@ use glam::{Quat, Vec3};
 use image::RgbImage;
 use serde::{Deserialize, Serialize};
 
-pub use refine::{RefineReport, Refinement};
+pub use refine::{FinalRefinement, RefineReport};
 pub use state::MapperState;
 
 use super::density::{self, Candidate};
+use super::gaussian_stats::{self, GaussianStats};
 use super::keyframe::{DepthSource, MappedKeyframe};
-use super::ledger::{self, Ledger};
 use super::plane_sweep::{self, SourceView};
-use super::refine_poses::{self, RefinedPair};
+use super::refine_poses::RefinedPair;
 use super::schedule::{self, Session, Step};
-use super::{DensityStrategy, Keyframe, KeyframeId, LimitsConfig, MappingConfig, exposure, limits, points, seeding};
+use super::{
+    DensityStrategy, Keyframe, KeyframeId, LimitsConfig, MappingConfig, RefinePosesConfig, exposure, initialise_from_points,
+    insertion, limits,
+};
 use crate::geometry::Se3;
 use crate::gpu::{Gpu, GpuError};
-use crate::optimise::{GaussianScore, Optimiser, StepReport, TrainingView, WrongPixels};
-use crate::render::{GpuCloud, Rasterizer, Rendered};
+use crate::optimise::{GaussianScore, StepReport, Trainer, TrainingView, WrongPixels};
+use crate::render::{GpuCloud, Rendered};
 use crate::sequence::{KnownPoint, RectifiedImage};
 use crate::splat::{Exposure, GaussianCloud, ViewCamera};
 
@@ -55,7 +58,8 @@ pub enum MappingError {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct KeyframeReport {
     pub id: KeyframeId,
-    pub seeded: usize,
+    /// Gaussians inserted.
+    pub inserted: usize,
     pub pruned: usize,
     /// Gaussians that came by dividing others.
     pub grown: usize,
@@ -73,10 +77,9 @@ pub struct KeyframeReport {
 pub struct Mapper {
     config: MappingConfig,
     gpu: Arc<Gpu>,
-    rasterizer: Rasterizer,
-    optimiser: Optimiser,
+    trainer: Trainer,
     cloud: GpuCloud,
-    ledger: Ledger,
+    stats: GaussianStats,
     keyframes: Vec<MappedKeyframe>,
     rng: Rng,
     step_times: Vec<Duration>,
@@ -84,13 +87,11 @@ pub struct Mapper {
 
 impl Mapper {
     pub fn new(gpu: Arc<Gpu>, config: &MappingConfig) -> Result<Self, MappingError> {
-        let rasterizer = Rasterizer::new(gpu.clone())?;
         Ok(Self {
             config: config.clone(),
-            optimiser: Optimiser::new(&rasterizer)?,
-            rasterizer,
+            trainer: Trainer::new(gpu.clone())?,
             cloud: GpuCloud::new(&gpu, config.sh_degree, FIRST_CAPACITY)?,
-            ledger: Ledger::default(),
+            stats: GaussianStats::default(),
             keyframes: Vec::new(),
             rng: Rng::with_seed(config.seed),
             step_times: Vec::new(),
@@ -98,7 +99,7 @@ impl Mapper {
         })
     }
 
-    /// Takes in a keyframe: seeds what the map lacks, optimises over the window, prunes. `stop` is asked between the steps. A keyframe without
+    /// Takes in a keyframe: inserts what the map lacks, optimises over the window, prunes. `stop` is asked between the steps. A keyframe without
     /// depth is passed over until there is a map.
     pub fn insert(&mut self, keyframe: &Keyframe, stop: &dyn Fn() -> bool) -> Result<KeyframeReport, MappingError> {
         if keyframe.image.depth.is_none() && self.has_not_begun() {
@@ -110,35 +111,35 @@ impl Mapper {
         if exposure != Exposure::default() {
             keyframe.to_mut().image.color = exposure::corrected(&keyframe.image.color, &exposure);
         }
-        // Before its seeds: a bound on memory leaves these what the image has left.
+        // Before its seeds: a bound on memory leaves to it what the image has left.
         let mapped = MappedKeyframe::new(&self.gpu, &keyframe, exposure, self.config.learns_at_half_size())?;
         self.keyframes.push(mapped);
         self.limit_keyframes();
-        let seeded = self.seed(&keyframe, rendered.as_ref())?;
+        let inserted = self.insert_gaussians(&keyframe, rendered.as_ref())?;
         let first = self.keyframes.len() == 1;
         let iterations = if first { self.config.first_iterations } else { self.config.iterations_per_keyframe };
         if iterations == 0 {
             return Ok(KeyframeReport {
                 id: keyframe.id,
-                seeded,
+                inserted,
                 gaussians: self.cloud.len(),
                 exposure,
                 ..KeyframeReport::default()
             });
         }
         let report = self.optimise(iterations, stop)?;
-        Ok(KeyframeReport { id: keyframe.id, seeded, gaussians: self.cloud.len(), exposure, ..report })
+        Ok(KeyframeReport { id: keyframe.id, inserted, gaussians: self.cloud.len(), exposure, ..report })
     }
 
     /// Takes in points of the scene that are known before any keyframe, in the keyframes' world; `anchor` is the first of these.
     pub fn add_points(&mut self, known: &[KnownPoint], anchor: KeyframeId) -> Result<(), MappingError> {
-        let seeds = points::seed(known, &self.config.points, self.config.sh_degree);
-        let left_out = self.cloud.append(&self.gpu, &seeds)?;
-        self.ledger.append(anchor, seeds.len() - left_out);
+        let new = initialise_from_points::gaussians(known, &self.config.points, self.config.sh_degree);
+        let left_out = self.cloud.append(&self.gpu, &new)?;
+        self.stats.append(anchor, new.len() - left_out);
         Ok(())
     }
 
-    /// Moves earlier keyframes to better poses, and with those that move far the Gaussians seeded from them; returns how many. Unknown
+    /// Moves earlier keyframes to better poses, and with those that move far the Gaussians inserted from them; returns how many. Unknown
     /// ids are those that were never sent to the mapper.
     pub fn update_poses(&mut self, updates: &[(KeyframeId, Se3)]) -> Result<usize, MappingError> {
         let mut motions = BTreeMap::new();
@@ -146,11 +147,13 @@ impl Mapper {
         for keyframe in &mut self.keyframes {
             if let Some(world_from_camera) = updates.get(&keyframe.id) {
                 let old_world_from_camera = keyframe.tracked_from_world.inverse();
-                motions.extend(ledger::motion(&old_world_from_camera, world_from_camera).map(|motion| (keyframe.id, motion)));
+                motions.extend(
+                    gaussian_stats::motion(&old_world_from_camera, world_from_camera).map(|motion| (keyframe.id, motion)),
+                );
                 keyframe.track(world_from_camera.inverse());
             }
         }
-        let moved = self.ledger.moved(&motions);
+        let moved = self.stats.moved(&motions);
         self.cloud.transform(&self.gpu, &moved)?;
         Ok(moved.iter().map(|(run, _)| run.len()).sum())
     }
@@ -160,7 +163,7 @@ impl Mapper {
         if !self.config.refine_poses.enabled || self.keyframes.is_empty() {
             return Vec::new();
         }
-        refine_poses::pairs(&self.keyframes, &schedule::window(&self.keyframes, &self.config.window), &self.config.refine_poses)
+        relative_poses(&self.keyframes, &schedule::window(&self.keyframes, &self.config.window), &self.config.refine_poses)
     }
 
     /// The map as it is now.
@@ -170,7 +173,7 @@ impl Mapper {
 
     /// Renders the map over black.
     pub fn render(&mut self, camera: &ViewCamera) -> Result<Rendered, MappingError> {
-        Ok(self.rasterizer.render(&self.cloud, camera, [0.0; 3])?)
+        Ok(self.trainer.render(&self.cloud, camera, [0.0; 3])?)
     }
 
     /// Duration of each step so far: its share of its batch.
@@ -220,22 +223,22 @@ impl Mapper {
         shown.map_or(last, |rendered| exposure::measure(image, rendered, &last, config))
     }
 
-    fn seed(&mut self, keyframe: &Keyframe, rendered: Option<&Rendered>) -> Result<usize, MappingError> {
+    fn insert_gaussians(&mut self, keyframe: &Keyframe, rendered: Option<&Rendered>) -> Result<usize, MappingError> {
         if keyframe.image.depth.is_none() {
             return Ok(0);
         }
-        let mut seeds = seeding::seed(keyframe, rendered, &self.config.seeding, self.config.sh_degree);
+        let mut new = insertion::gaussians(keyframe, rendered, &self.config.insertion, self.config.sh_degree);
         if self.config.limits.limits_gaussians() {
             let most = self.most_gaussians();
             self.cloud.limit(most);
-            seeds = seeds.thinned(limits::seeds_allowed(seeds.len(), most));
-            let keep = limits::most_useful(self.ledger.entries(), most - seeds.len());
+            new = new.thinned(limits::insertions_allowed(new.len(), most));
+            let keep = limits::most_useful(self.stats.histories(), most - new.len());
             self.cloud.change(&self.gpu, &keep, (&[], &[]))?;
-            self.ledger.apply(&keep, std::iter::empty());
+            self.stats.apply(&keep, std::iter::empty());
         }
-        let left_out = self.cloud.append(&self.gpu, &seeds)?;
-        self.ledger.append(keyframe.id, seeds.len() - left_out);
-        Ok(seeds.len())
+        let left_out = self.cloud.append(&self.gpu, &new)?;
+        self.stats.append(keyframe.id, new.len() - left_out);
+        Ok(new.len())
     }
 
     /// How many Gaussians there may be, at present, when there is to be room for one more keyframe's image.
@@ -269,16 +272,16 @@ impl Mapper {
             return Ok((0, 0));
         }
         let scores = match self.scoring() {
-            Some(_) => self.optimiser.read_scores(&self.gpu, &self.cloud)?,
+            Some(_) => self.trainer.read_scores(&self.cloud)?,
             None => vec![GaussianScore::default(); self.cloud.len()],
         };
-        self.ledger.scored(&scores);
+        self.stats.scored(&scores);
         let [geometry, scales, rotations] = [0, 1, 2].map(|plane| self.cloud.read_plane(&self.gpu, plane));
         let (geometry, scales, rotations) = (geometry?, scales?, rotations?);
         let candidate = |i: usize| {
             let ([x, y, z, raw_opacity], [a, b, c, _], [qw, qx, qy, qz]) = (geometry[i], scales[i], rotations[i]);
             let (mean, log_scale, rotation) = (Vec3::new(x, y, z), Vec3::new(a, b, c), Quat::from_xyzw(qx, qy, qz, qw));
-            Candidate { mean, raw_opacity, log_scale, rotation, score: scores[i], entry: self.ledger.entries()[i] }
+            Candidate { mean, raw_opacity, log_scale, rotation, score: scores[i], history: self.stats.histories()[i] }
         };
         let candidates: Vec<Candidate> = (0..self.cloud.len()).map(candidate).collect();
         let plan = density::plan(&candidates, self.most_gaussians(), &self.config.density);
@@ -287,7 +290,7 @@ impl Mapper {
         let parents: Vec<u32> = plan.children.iter().map(|c| c.parent).collect();
         let geometry: Vec<[[f32; 4]; 2]> = plan.children.iter().map(geometry).collect();
         self.cloud.change(&self.gpu, &plan.keep, (&parents, &geometry))?;
-        self.ledger.apply(&plan.keep, parents.into_iter());
+        self.stats.apply(&plan.keep, parents.into_iter());
         // Two children take their parent's place.
         Ok((before - plan.keep.len() - children / 2, children / 2))
     }
@@ -307,7 +310,7 @@ impl Mapper {
         let mut session = Session::new(window.clone(), unscored);
         let due = (density.after_share * unscored as f32).round() as usize;
         let before = self.steps_of(&mut session, due, stop)?;
-        self.ledger.keyframe_mapped();
+        self.stats.keyframe_mapped();
         let (scored, (pruned, grown)) = if controlled { (self.score(&window)?, self.control_density()?) } else { (0, (0, 0)) };
         let after = self.steps_of(&mut session, unscored, stop)?;
         let done = before.0 + after.0;
@@ -320,14 +323,14 @@ impl Mapper {
         let (mut psnr_sum, mut done) = (0.0, 0);
         let most = if self.config.yields_to_keyframes { YIELDING_BATCH } else { BATCH };
         while !session.is_over(end) && !stop() {
-            let config = (&self.config.window, &self.config.skip);
-            let batch = session.next(most.min(end - session.taken()), &self.keyframes, &mut self.rng, config);
+            let count = most.min(end - session.taken());
+            let batch = session.next(count, &self.keyframes, &mut self.rng, &self.config.window, &self.config.schedule);
             let reports = self.steps(&batch, None)?;
             self.refine_poses(session.window(), &batch, &reports);
             psnr_sum += reports.iter().map(|r| r.loss.psnr_db()).sum::<f32>();
             done += batch.len();
             let losses: Vec<f32> = reports.iter().map(|r| r.loss.total(&self.config.loss)).collect();
-            session.take_note(&batch, &losses, self.config.skip.min_gain);
+            session.take_note(&batch, &losses, self.config.schedule.min_gain);
         }
         Ok((done, psnr_sum))
     }
@@ -337,33 +340,37 @@ impl Mapper {
         let config = &self.config.refine_poses;
         let moves = |step: &Step| config.enabled && step.keyframe > 0 && window.contains(&step.keyframe);
         for (step, report) in batch.iter().zip(reports).filter(|(step, _)| moves(step)) {
-            self.keyframes[step.keyframe].refine(&report.pose, step.pace, config);
+            self.keyframes[step.keyframe].refine(&report.pose, step.lr_scale, config);
         }
     }
 
     /// A last step of each of some keyframes of the window, evenly spread over it, that scores the Gaussians; returns their number.
     fn score(&mut self, window: &[usize]) -> Result<usize, MappingError> {
         let Some(wrong) = self.scoring() else { return Ok(0) };
-        self.optimiser.begin_scores(&self.gpu, &self.cloud)?;
+        self.trainer.begin_scores(&self.cloud)?;
         let views = self.config.density.views.min(window.len());
         let chosen: Vec<Step> = (0..views)
-            .map(|k| Step { keyframe: window[k * window.len() / views], coarse: false, pace: self.config.window.last_pace })
+            .map(|k| Step {
+                keyframe: window[k * window.len() / views],
+                coarse: false,
+                lr_scale: self.config.window.final_lr_scale,
+            })
             .collect();
         Ok(self.steps(&chosen, Some(wrong))?.len())
     }
 
     fn steps(&mut self, batch: &[Step], scored: Option<WrongPixels>) -> Result<Vec<StepReport>, MappingError> {
         // A pose is refined by its whole image.
-        let skip = self.config.skip.tiles().filter(|_| !self.config.refine_poses.enabled);
+        let tile_sampling = self.config.tile_sampling.sampling().filter(|_| !self.config.refine_poses.enabled);
         let view = |step: &Step| {
             let keyframe = &self.keyframes[step.keyframe];
             let view = keyframe.view(step.coarse).expect("only keyframes with images are drawn");
-            let depth_trust = if keyframe.depth_is_estimated() { self.config.plane_sweep.trust } else { 1.0 };
-            TrainingView { pace: step.pace, depth_trust, scored, skip, ..view }
+            let depth_confidence = if keyframe.depth_is_estimated() { self.config.plane_sweep.depth_confidence } else { 1.0 };
+            TrainingView { lr_scale: step.lr_scale, depth_confidence, scored, tile_sampling, ..view }
         };
         let views: Vec<TrainingView<'_>> = batch.iter().map(view).collect();
         let started = Instant::now();
-        let reports = self.optimiser.steps(&mut self.rasterizer, &self.cloud, &views, (&self.config.loss, &self.config.adam))?;
+        let reports = self.trainer.steps(&self.cloud, &views, &self.config.loss, &self.config.adam)?;
         self.step_times.extend(std::iter::repeat_n(started.elapsed() / batch.len().max(1) as u32, batch.len()));
         for (step, report) in batch.iter().zip(&reports) {
             let keyframe = &mut self.keyframes[step.keyframe];
@@ -374,4 +381,26 @@ impl Mapper {
         }
         Ok(reports)
     }
+}
+
+/// The window's keyframes, each relative to the one of the window with which it shares most, where both have been refined.
+fn relative_poses(keyframes: &[MappedKeyframe], window: &[usize], config: &RefinePosesConfig) -> Vec<RefinedPair> {
+    // The first keyframe is the world, and right by definition.
+    let refined = |k: usize| k == 0 || keyframes[k].refinement.is_informative();
+    let partner = |k: usize| {
+        let of_window = |id: &KeyframeId| window.iter().copied().find(|w| keyframes[*w].id == *id);
+        keyframes[k].covisible.iter().filter_map(of_window).find(|w| refined(*w))
+    };
+    let pair = |(k, other): (usize, usize)| {
+        let (keyframe, relative) = (&keyframes[k], &keyframes[other]);
+        let sigma_rotation_rad = config.sigma_pixels / keyframe.camera.pinhole.fx;
+        RefinedPair {
+            keyframe: keyframe.id,
+            relative_to: relative.id,
+            keyframe_from_relative: keyframe.camera.camera_from_world * relative.camera.camera_from_world.inverse(),
+            sigma_translation_metres: sigma_rotation_rad * keyframe.depth_metres,
+            sigma_rotation_rad,
+        }
+    };
+    window.iter().filter(|k| refined(**k)).filter_map(|k| Some((*k, partner(*k)?))).map(pair).collect()
 }

@@ -1,27 +1,30 @@
-//! The mapping thread's work: keyframes in, Gaussians seeded, optimised over a sliding window and pruned, snapshots out.
+//! The mapping thread's work: keyframes in, Gaussians inserted, optimised over a sliding window and pruned, snapshots out.
 //! A refinement over all keyframes may follow. Knows nothing of tracking; poses and covisibility arrive with the keyframes.
 
 mod config;
 mod density;
 mod exposure;
+mod gaussian_stats;
+mod initialise_from_points;
+mod insertion;
 mod keyframe;
-mod ledger;
+mod knn;
 mod limits;
 mod mapper;
 mod message;
-mod neighbours;
 mod plane_sweep;
-mod points;
 mod refine_poses;
 mod schedule;
-mod seeding;
 
-pub use config::{MappingConfig, PointsConfig, RefineConfig, SeedingConfig, SkipConfig, WindowConfig};
-pub use density::{ClassicConfig, DensityConfig, DensityStrategy, VcdConfig};
+pub use config::{InsertionConfig, MappingConfig, PointsConfig, RefineConfig, ScheduleConfig, TileSamplingConfig, WindowConfig};
+pub use density::{ClassicConfig, DensityConfig, DensityStrategy, MultiViewConfig};
 pub use exposure::ExposureConfig;
-pub use keyframe::{DepthSource, Keyframe, KeyframeId, RightImage};
+pub use keyframe::{DepthSource, Keyframe, RightImage};
 pub use limits::LimitsConfig;
-pub use mapper::{KeyframeReport, Mapper, MapperState, MappingError, RefineReport, Refinement};
+pub use mapper::{FinalRefinement, KeyframeReport, Mapper, MapperState, MappingError, RefineReport};
 pub use message::MapperMessage;
 pub use plane_sweep::PlaneSweepConfig;
 pub use refine_poses::{RefinePosesConfig, RefinedPair};
+
+/// Index of a keyframe in the order of tracking; unique and ascending.
+pub type KeyframeId = usize;

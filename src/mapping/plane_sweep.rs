@@ -30,12 +30,20 @@ pub struct PlaneSweepConfig {
     /// Share of the landmarks that must be met, for anything to be believed.
     pub min_agreement: f64,
     /// What such depth, and that of landmarks alone, counts in the loss: as a share of measured depth (`mapping.loss.depth_weight`).
-    pub trust: f32,
+    pub depth_confidence: f32,
 }
 
 impl Default for PlaneSweepConfig {
     fn default() -> Self {
-        Self { enabled: true, planes: 64, views: 3, min_parallax_pixels: 3.0, uniqueness: 1.04, min_agreement: 0.6, trust: 0.25 }
+        Self {
+            enabled: true,
+            planes: 64,
+            views: 3,
+            min_parallax_pixels: 3.0,
+            uniqueness: 1.04,
+            min_agreement: 0.6,
+            depth_confidence: 0.25,
+        }
     }
 }
 
@@ -48,7 +56,11 @@ impl PlaneSweepConfig {
         if !(self.uniqueness >= 1.0 && self.min_parallax_pixels >= 0.0 && (0.0..=1.0).contains(&self.min_agreement)) {
             return Err("uniqueness must be at least 1, min_parallax_pixels positive, min_agreement between 0 and 1".into());
         }
-        if (0.0..=1.0).contains(&self.trust) { Ok(()) } else { Err("trust must lie between 0 and 1".into()) }
+        if (0.0..=1.0).contains(&self.depth_confidence) {
+            Ok(())
+        } else {
+            Err("depth_confidence must lie between 0 and 1".into())
+        }
     }
 }
 

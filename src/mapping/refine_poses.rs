@@ -8,9 +8,7 @@ use nalgebra::Vector6;
 use serde::{Deserialize, Serialize};
 
 use super::KeyframeId;
-use super::keyframe::MappedKeyframe;
 use crate::geometry::{Se3, se3};
-use crate::sequence::RectifiedImage;
 
 /// Decay of the first and the second moments.
 const BETA_1: f64 = 0.9;
@@ -32,8 +30,8 @@ pub struct RefinePosesConfig {
     /// Whether the tracker is told the refined poses, as measurements of relative poses.
     pub tell_tracker: bool,
     /// Most that a step turns or shifts a keyframe: radians, metres.
-    pub rotation_rate: f64,
-    pub translation_rate: f64,
+    pub lr_rotation: f64,
+    pub lr_translation: f64,
     /// Share of the way back to the tracker's pose that each step begins with: keeps the window from drifting off as a whole.
     pub pull: f64,
     /// A step that would lead further than this from the tracker's pose is not taken: radians, metres.
@@ -51,8 +49,8 @@ impl Default for RefinePosesConfig {
         Self {
             enabled: false,
             tell_tracker: true,
-            rotation_rate: 1e-4,
-            translation_rate: 2e-4,
+            lr_rotation: 1e-4,
+            lr_translation: 2e-4,
             pull: 0.05,
             max_turn_rad: 0.01,
             max_shift_metres: 0.02,
@@ -65,8 +63,8 @@ impl RefinePosesConfig {
     /// Says what is wrong with the values, if anything.
     pub(super) fn validate(&self) -> Result<(), String> {
         let values = [
-            ("rotation_rate", self.rotation_rate),
-            ("translation_rate", self.translation_rate),
+            ("lr_rotation", self.lr_rotation),
+            ("lr_translation", self.lr_translation),
             ("pull", self.pull),
             ("max_turn_rad", self.max_turn_rad),
             ("max_shift_metres", self.max_shift_metres),
@@ -84,7 +82,7 @@ impl RefinePosesConfig {
 
 /// How one keyframe's pose differs from the tracker's, and Adam's moments.
 #[derive(Clone, Copy, Debug, Serialize, Deserialize)]
-pub(super) struct Refinement {
+pub(super) struct PoseRefinement {
     /// camera_from_world = refined_from_tracked · tracked_from_world
     pub refined_from_tracked: Se3,
     /// Mean of the gradient by (ρ, θ), and of its squared lengths.
@@ -93,16 +91,21 @@ pub(super) struct Refinement {
     steps: i32,
 }
 
-impl Default for Refinement {
+impl Default for PoseRefinement {
     fn default() -> Self {
         Self { refined_from_tracked: Se3::identity(), mean: Vector6::zeros(), mean_squares: [0.0; 2], steps: 0 }
     }
 }
 
-impl Refinement {
+impl PoseRefinement {
+    /// Whether enough steps were taken for the pose to differ from the tracker's by what the images say.
+    pub fn is_informative(&self) -> bool {
+        self.steps >= MIN_STEPS
+    }
+
     /// One step down a loss's `gradient` by τ = (ρ, θ) of `camera_from_world ← Exp(τ)·camera_from_world`, taken where the refined pose
-    /// is; `pace` is a share of the rates. A gradient that is not finite says nothing.
-    pub fn step(&mut self, gradient: &[f32; 6], pace: f32, config: &RefinePosesConfig) {
+    /// is; `lr_scale` is a share of the rates. A gradient that is not finite says nothing.
+    pub fn step(&mut self, gradient: &[f32; 6], lr_scale: f32, config: &RefinePosesConfig) {
         let gradient = Vector6::from(gradient.map(f64::from));
         if !gradient.iter().all(|g| g.is_finite()) {
             return;
@@ -111,12 +114,12 @@ impl Refinement {
         self.mean = self.mean * BETA_1 + gradient * (1.0 - BETA_1);
         let [unbiased_1, unbiased_2] = [BETA_1, BETA_2].map(|beta| 1.0 - beta.powi(self.steps));
         let mut tau = -self.mean / unbiased_1;
-        for (k, rate) in [config.translation_rate, config.rotation_rate].into_iter().enumerate() {
+        for (k, rate) in [config.lr_translation, config.lr_rotation].into_iter().enumerate() {
             let squared = gradient.fixed_rows::<3>(3 * k).norm_squared();
             let mean_square = &mut self.mean_squares[k];
             *mean_square = *mean_square * BETA_2 + squared * (1.0 - BETA_2);
             let length = (*mean_square / unbiased_2).sqrt();
-            tau.fixed_rows_mut::<3>(3 * k).scale_mut(rate * f64::from(pace) / (length + EPSILON));
+            tau.fixed_rows_mut::<3>(3 * k).scale_mut(rate * f64::from(lr_scale) / (length + EPSILON));
         }
         let kept = se3::log(&self.refined_from_tracked) * (1.0 - config.pull);
         let mut refined = se3::exp(&tau) * se3::exp(&kept);
@@ -137,36 +140,6 @@ pub struct RefinedPair {
     /// Standard deviations of each coordinate of the translation, in the keyframe's frame, and of the rotation about each axis.
     pub sigma_translation_metres: f64,
     pub sigma_rotation_rad: f64,
-}
-
-/// The window's keyframes, each relative to the one of the window with which it shares most, where both have been refined.
-pub(super) fn pairs(keyframes: &[MappedKeyframe], window: &[usize], config: &RefinePosesConfig) -> Vec<RefinedPair> {
-    // The first keyframe is the world, and right by definition.
-    let refined = |k: usize| k == 0 || keyframes[k].refinement.steps >= MIN_STEPS;
-    let partner = |k: usize| {
-        let of_window = |id: &KeyframeId| window.iter().copied().find(|w| keyframes[*w].id == *id);
-        keyframes[k].covisible.iter().filter_map(of_window).find(|w| refined(*w))
-    };
-    let pair = |(k, other): (usize, usize)| {
-        let (keyframe, relative) = (&keyframes[k], &keyframes[other]);
-        let sigma_rotation_rad = config.sigma_pixels / keyframe.camera.pinhole.fx;
-        RefinedPair {
-            keyframe: keyframe.id,
-            relative_to: relative.id,
-            keyframe_from_relative: keyframe.camera.camera_from_world * relative.camera.camera_from_world.inverse(),
-            sigma_translation_metres: sigma_rotation_rad * keyframe.depth_metres,
-            sigma_rotation_rad,
-        }
-    };
-    window.iter().filter(|k| refined(**k)).filter_map(|k| Some((*k, partner(*k)?))).map(pair).collect()
-}
-
-/// Median of an image's measured depths, metres; 1 if there are none.
-pub(super) fn median_depth(image: &RectifiedImage) -> f64 {
-    let measured = image.depth.iter().flat_map(|depth| depth.metres.iter().copied().filter(|z| *z > 0.0));
-    let mut depths: Vec<f32> = measured.collect();
-    let middle = depths.len() / 2;
-    if depths.is_empty() { 1.0 } else { f64::from(*depths.select_nth_unstable_by(middle, f32::total_cmp).1) }
 }
 
 #[cfg(test)]
@@ -190,8 +163,8 @@ mod tests {
     fn steps_lead_to_the_least_loss_and_not_beyond_the_bounds() {
         let config = RefinePosesConfig { enabled: true, pull: 0.0, ..Default::default() };
         let truth = se3::exp(&Vector6::new(0.004, -0.003, 0.002, 0.003, -0.002, 0.001));
-        let mut refinement = Refinement::default();
-        let distance = |r: &Refinement| se3::log(&(r.refined_from_tracked * truth.inverse())).norm();
+        let mut refinement = PoseRefinement::default();
+        let distance = |r: &PoseRefinement| se3::log(&(r.refined_from_tracked * truth.inverse())).norm();
         let before = distance(&refinement);
         for step in 0..800 {
             refinement.step(&gradient(&refinement.refined_from_tracked, &truth), 1.0 - step as f32 / 800.0, &config);
@@ -212,7 +185,7 @@ mod tests {
     #[test]
     fn nonsense_moves_nothing() {
         let config = RefinePosesConfig { enabled: true, ..Default::default() };
-        let mut refinement = Refinement::default();
+        let mut refinement = PoseRefinement::default();
         for gradient in [[f32::NAN; 6], [0.0, f32::INFINITY, 0.0, 0.0, 0.0, 0.0], [0.0; 6]] {
             refinement.step(&gradient, 1.0, &config);
         }

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use fastrand::Rng;
 
 use super::keyframe::MappedKeyframe;
-use super::{SkipConfig, WindowConfig};
+use super::{ScheduleConfig, WindowConfig};
 
 /// So many steps are judged together,
 const JUDGED: usize = 10;
@@ -51,8 +51,8 @@ pub(super) struct Step {
     pub keyframe: usize,
     /// At half the size.
     pub coarse: bool,
-    /// Share of Adam's step sizes.
-    pub pace: f32,
+    /// Factor on all learning rates.
+    pub lr_scale: f32,
 }
 
 impl Session {
@@ -68,7 +68,7 @@ impl Session {
         self.taken
     }
 
-    /// Whether `end` steps are taken, or more are not worth their time.
+    /// Whether `end` steps are taken, or more are of no use.
     pub fn is_over(&self, end: usize) -> bool {
         self.taken >= end || self.converged
     }
@@ -80,24 +80,25 @@ impl Session {
         count: usize,
         keyframes: &[MappedKeyframe],
         rng: &mut Rng,
-        (config, skip): (&WindowConfig, &SkipConfig),
+        window: &WindowConfig,
+        schedule: &ScheduleConfig,
     ) -> Vec<Step> {
         let count = count.min(self.steps - self.taken);
         let draw = |taken: usize| {
-            let keyframe = if keyframes.len() > self.window.len() && rng.f32() < config.older_share {
-                draw_older(keyframes, config.recent, rng, skip.draw_by_loss)
+            let keyframe = if keyframes.len() > self.window.len() && rng.f32() < window.older_share {
+                draw_older(keyframes, window.recent, rng, schedule.draw_by_loss)
             } else {
                 self.window[taken % self.window.len()]
             };
             let elapsed = taken as f32 / self.steps as f32;
-            Step { keyframe, coarse: elapsed < skip.coarse_share, pace: 1.0 - (1.0 - config.last_pace) * elapsed }
+            Step { keyframe, coarse: elapsed < schedule.coarse_share, lr_scale: 1.0 - (1.0 - window.final_lr_scale) * elapsed }
         };
         let steps = (self.taken..self.taken + count).map(draw).collect();
         self.taken += count;
         steps
     }
 
-    /// Takes note of a batch's losses; sees whether more steps are worth their time.
+    /// Takes note of a batch's losses; sees whether more steps still gain.
     pub fn take_note(&mut self, batch: &[Step], losses: &[f32], min_gain: f32) {
         for (step, &loss) in batch.iter().zip(losses) {
             self.gain.steps += 1;

@@ -12,17 +12,17 @@ use crate::render::layout::AdamSetup;
 pub struct AdamConfig {
     /// Position, in units of the Gaussian's own size (geometric mean of its standard deviations) a step: fine ones move finely, and the
     /// result does not depend on the unit of length.
-    pub position_rate: f32,
+    pub lr_position: f32,
     /// Raw opacity (logit) a step.
-    pub opacity_rate: f32,
+    pub lr_opacity: f32,
     /// Log scale a step.
-    pub scale_rate: f32,
+    pub lr_log_scale: f32,
     /// Quaternion component a step.
-    pub rotation_rate: f32,
+    pub lr_rotation: f32,
     /// Constant colour coefficient a step.
-    pub color_rate: f32,
+    pub lr_color: f32,
     /// Other harmonics' coefficients a step.
-    pub harmonics_rate: f32,
+    pub lr_harmonics: f32,
     /// The other harmonics move every n-th step only: they converge slowly, and are most of the parameters (FastGS: 16).
     pub harmonics_every: usize,
     /// Decay of the first and the second moments.
@@ -37,25 +37,25 @@ pub struct AdamConfig {
     /// The map is shown with each Gaussian's parameters averaged over about a quarter of its steps so far, but no more than about so many
     /// of its last ones (Polyak & Juditsky 1992): successive views pull to and fro, and in between is where they agree. The steps
     /// themselves go on from the parameters as they are, and stay quick. 1: the map is shown as it is.
-    pub averaged_steps: f32,
+    pub ema_steps: f32,
 }
 
 impl Default for AdamConfig {
     fn default() -> Self {
         Self {
-            position_rate: 0.08,
-            opacity_rate: 1e-1,
-            scale_rate: 6e-2,
-            rotation_rate: 1.2e-2,
-            color_rate: 2e-2,
-            harmonics_rate: 1e-2,
+            lr_position: 0.08,
+            lr_opacity: 1e-1,
+            lr_log_scale: 6e-2,
+            lr_rotation: 1.2e-2,
+            lr_color: 2e-2,
+            lr_harmonics: 1e-2,
             harmonics_every: 1,
             beta_1: 0.8,
             beta_2: 0.999,
             epsilon: 1e-15,
             max_elongation: 8.0,
             color_settling_steps: 200.0,
-            averaged_steps: 10.0,
+            ema_steps: 10.0,
         }
     }
 }
@@ -63,8 +63,7 @@ impl Default for AdamConfig {
 impl AdamConfig {
     /// Says what is wrong with the values, if anything.
     pub fn validate(&self) -> Result<(), String> {
-        let rates =
-            [self.position_rate, self.opacity_rate, self.scale_rate, self.rotation_rate, self.color_rate, self.harmonics_rate];
+        let rates = [self.lr_position, self.lr_opacity, self.lr_log_scale, self.lr_rotation, self.lr_color, self.lr_harmonics];
         if rates.iter().any(|rate| !(rate.is_finite() && *rate >= 0.0)) {
             return Err("every Adam rate must be finite and not negative".into());
         }
@@ -77,8 +76,8 @@ impl AdamConfig {
         if !(self.color_settling_steps.is_finite() && self.color_settling_steps >= 0.0) {
             return Err("color_settling_steps must be finite and not negative".into());
         }
-        if !(self.averaged_steps.is_finite() && self.averaged_steps >= 1.0) {
-            return Err("averaged_steps must be at least 1".into());
+        if !(self.ema_steps.is_finite() && self.ema_steps >= 1.0) {
+            return Err("ema_steps must be at least 1".into());
         }
         if !(self.max_elongation.is_finite() && self.max_elongation > 1.0) {
             return Err("max_elongation must be greater than 1".into());
@@ -91,28 +90,28 @@ impl AdamConfig {
     /// The same with the rate of positions multiplied by one factor, and all others by another.
     pub fn scaled(&self, position: f32, others: f32) -> Self {
         Self {
-            position_rate: self.position_rate * position,
-            opacity_rate: self.opacity_rate * others,
-            scale_rate: self.scale_rate * others,
-            rotation_rate: self.rotation_rate * others,
-            color_rate: self.color_rate * others,
-            harmonics_rate: self.harmonics_rate * others,
+            lr_position: self.lr_position * position,
+            lr_opacity: self.lr_opacity * others,
+            lr_log_scale: self.lr_log_scale * others,
+            lr_rotation: self.lr_rotation * others,
+            lr_color: self.lr_color * others,
+            lr_harmonics: self.lr_harmonics * others,
             ..self.clone()
         }
     }
 
-    /// The GPU's copy for step number `step` of the map, with all rates times `pace`.
-    pub(super) fn setup(&self, step: usize, pace: f32) -> AdamSetup {
-        let p = self.position_rate;
+    /// The GPU's copy for step number `step` of the map, with all rates times `lr_scale`.
+    pub(super) fn setup(&self, step: usize, lr_scale: f32) -> AdamSetup {
+        let p = self.lr_position;
         let rates = [
-            [p, p, p, self.opacity_rate],
+            [p, p, p, self.lr_opacity],
             // Lanes that hold no parameter stand still.
-            [self.scale_rate, self.scale_rate, self.scale_rate, 0.0],
-            [self.rotation_rate; 4],
-            [self.color_rate, self.color_rate, self.color_rate, 0.0],
-            [self.harmonics_rate; 4],
+            [self.lr_log_scale, self.lr_log_scale, self.lr_log_scale, 0.0],
+            [self.lr_rotation; 4],
+            [self.lr_color, self.lr_color, self.lr_color, 0.0],
+            [self.lr_harmonics; 4],
         ];
-        let rates = rates.map(|lanes| lanes.map(|rate| rate * pace));
+        let rates = rates.map(|lanes| lanes.map(|rate| rate * lr_scale));
         AdamSetup {
             rates,
             beta_1: self.beta_1,
@@ -123,7 +122,7 @@ impl AdamConfig {
             step_harmonics: u32::from(step.is_multiple_of(self.harmonics_every)),
             log_elongation: self.max_elongation.ln(),
             color_settling: if self.color_settling_steps > 0.0 { 1.0 / self.color_settling_steps } else { 0.0 },
-            least_share: 1.0 / self.averaged_steps,
+            least_share: 1.0 / self.ema_steps,
             pad: [0.0; 3],
         }
     }

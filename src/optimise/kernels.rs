@@ -24,8 +24,8 @@ impl Kernels {
             loss_reduce: kernel(&shaders::LOSS_REDUCE),
             loss_backward: kernel(&shaders::LOSS_BACKWARD),
             rasterize_backward: kernel(match form {
-                BlendForm::Wide => &shaders::RASTERIZE_BACKWARD_SPLATS,
-                BlendForm::Narrow => &shaders::RASTERIZE_BACKWARD_PIXELS,
+                BlendForm::Wide => &shaders::RASTERIZE_BACKWARD_WIDE,
+                BlendForm::Narrow => &shaders::RASTERIZE_BACKWARD_NARROW,
             }),
             project_backward: kernel(&shaders::PROJECT_BACKWARD),
             project_backward_adam: kernel(&shaders::PROJECT_BACKWARD_ADAM),

@@ -4,12 +4,12 @@ mod adam;
 mod image_buffers;
 mod kernels;
 mod loss;
-mod optimiser;
 mod scores;
-mod skip;
+mod tile_sampling;
+mod trainer;
 
 pub use adam::AdamConfig;
 pub use loss::{LossConfig, LossTerms, TargetImage};
-pub use optimiser::{Gradients, Optimiser, OptimiserState, StepReport, TrainingView};
 pub use scores::{GaussianScore, WrongPixels};
-pub use skip::TileSkip;
+pub use tile_sampling::TileSampling;
+pub use trainer::{Gradients, ImageGradients, StepReport, Trainer, TrainerState, TrainingView};

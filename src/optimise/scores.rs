@@ -104,7 +104,7 @@ impl Scores {
             (5, &ws.color_depth),
             (6, &ws.state),
             (7, image_gradients),
-            (8, &ws.pair_gradients),
+            (8, &ws.intersection_gradients),
             (9, &self.setup),
             (10, loss_total),
         ];
@@ -112,8 +112,8 @@ impl Scores {
         let gather = [
             (0, rasterizer.view()),
             (1, &ws.counters),
-            (2, &ws.pair_counts),
-            (3, &ws.pair_gradients),
+            (2, &ws.intersection_counts),
+            (3, &ws.intersection_gradients),
             (4, &ws.projected),
             (5, &self.scores),
             (6, &self.setup),

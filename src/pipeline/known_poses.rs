@@ -15,7 +15,7 @@ use crate::geometry::{Se3, StampedPose};
 use crate::mapping::{DepthSource, Keyframe, MapperMessage, MappingConfig};
 use crate::recording::Recording;
 use crate::run_folder::FrameRecord;
-use crate::sequence::{Frame, KnownPoint, Layout, RectifiedImage, Rectifier, Sensor};
+use crate::sequence::{Frame, KnownPoint, Layout, Rectifier, Sensor};
 use crate::tracking::{KeyframePose, StageTimes};
 
 /// What the mapper's lengths are made for: the median distance, in metres, at which a camera sees things in a room.
@@ -132,15 +132,10 @@ impl Follower<'_> {
         let image = self.rectifier.rectify(frame);
         let (id, covisible) = (self.keyframes.len(), self.covisible(&world_from_camera));
         let pose = KeyframePose { id, frame_index: frame.index, timestamp_s: frame.timestamp_s, world_from_camera };
-        let distance = median_depth(&image).unwrap_or(self.scene_distance);
+        let distance = image.median_depth_metres().unwrap_or(self.scene_distance);
         self.keyframes.push(Known { pose, distance });
         Keyframe { id, world_from_camera, image, depth_source: DepthSource::Sensor, covisible }
     }
-}
-
-fn median_depth(image: &RectifiedImage) -> Option<f64> {
-    let depth = image.depth.as_ref()?;
-    median(depth.metres.iter().filter(|metres| **metres > 0.0).map(|metres| f64::from(*metres)).collect())
 }
 
 /// Sends keyframes at their known poses until the frames end, or the mapper closes the channel.

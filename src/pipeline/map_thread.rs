@@ -12,7 +12,7 @@ use super::progress::guarded;
 use super::{PipelineError, Progress};
 use crate::evaluation::machine;
 use crate::gpu::Gpu;
-use crate::mapping::{KeyframeReport, Mapper, MapperMessage, MappingConfig, MappingError, RefinedPair, Refinement};
+use crate::mapping::{FinalRefinement, KeyframeReport, Mapper, MapperMessage, MappingConfig, MappingError, RefinedPair};
 use crate::run_folder::{CheckpointError, Checkpointer, KeyframeRecord, RunState};
 use crate::sequence::Frame;
 use crate::splat::{GaussianCloud, MapSnapshot};
@@ -59,7 +59,7 @@ struct Start {
     mapper: Mapper,
     cloud: Arc<GaussianCloud>,
     /// Of a resumed run whose final refinement had begun.
-    refinement: Option<Refinement>,
+    refinement: Option<FinalRefinement>,
     records: Vec<KeyframeRecord>,
 }
 
@@ -182,7 +182,7 @@ impl MapThread<'_> {
                 let refined = mapper.refined();
                 tracing::trace!(keyframe = keyframe.id, ?refined, "poses refined");
                 self.feedback.send(keyframe.id, &refined);
-                (Some(report), refined, report.seeded + report.iterations > 0)
+                (Some(report), refined, report.inserted + report.iterations > 0)
             }
         };
         let cloud = if changed { Some(Arc::new(mapper.download()?)) } else { None };
@@ -194,7 +194,7 @@ impl MapThread<'_> {
         &self,
         mapper: &mut Mapper,
         summary: &mut MapSummary,
-        begun: Option<Refinement>,
+        begun: Option<FinalRefinement>,
         checkpoints: &mut Checkpoints,
         on_round: &mut dyn FnMut(Round<'_>),
     ) -> Result<(), PipelineError> {
@@ -219,7 +219,7 @@ struct Checkpoints {
 }
 
 impl Checkpoints {
-    fn finished_one(&mut self, mapper: &Mapper, refinement: Option<&Refinement>, records: &[KeyframeRecord]) {
+    fn finished_one(&mut self, mapper: &Mapper, refinement: Option<&FinalRefinement>, records: &[KeyframeRecord]) {
         let Some(checkpointer) = &mut self.checkpointer else { return };
         let began = Instant::now();
         match guarded("mapping", || Ok(checkpointer.finished_one(mapper, refinement, records)?)) {

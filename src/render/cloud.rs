@@ -139,7 +139,7 @@ impl GpuCloud {
     }
 
     /// Keeps the Gaussians at `keep` (ascending indices) and appends a copy of each of `parents` with its own position, raw opacity and log
-    /// scale (planes 0 and 1). All keep their moments: a child goes on at its parent's pace.
+    /// scale (planes 0 and 1). All keep their moments: a child goes on at its parent's lr_scale.
     pub fn change(&mut self, gpu: &Gpu, keep: &[u32], (parents, geometry): (&[u32], &[[[f32; 4]; 2]])) -> Result<(), GpuError> {
         let sources: Vec<u32> = keep.iter().chain(parents).copied().collect();
         let capacity = self.capacity_for(gpu, sources.len());
@@ -155,7 +155,7 @@ impl GpuCloud {
         Ok(())
     }
 
-    /// Room for `needed` Gaussians: the present one, or twice as much within the limit and what the adapter can bind; if that is too
+    /// Capacity for `needed` Gaussians: the present one, or twice as much within the limit and what the adapter can bind; if that is too
     /// little, the allocation says how much is needed.
     fn capacity_for(&self, gpu: &Gpu, needed: usize) -> usize {
         let limit = self.limit.unwrap_or(usize::MAX).max(needed);

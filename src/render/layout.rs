@@ -19,7 +19,7 @@ pub const SORT_BLOCK: u32 = 1024;
 pub const SORT_CHUNK: u32 = 64;
 /// Counters in the counter buffer.
 pub const VISIBLE_COUNTER: u32 = 0;
-pub const PAIR_COUNTER: u32 = 1;
+pub const INTERSECTION_COUNTER: u32 = 1;
 pub const COUNTERS: u32 = 2;
 
 /// Planes of vec4 that precede the higher harmonics: (position, raw opacity), (log scale, -), rotation (w, x, y, z), (constant colour, -).
@@ -44,6 +44,14 @@ impl BlendForm {
     /// The faster form on this adapter.
     pub fn of(gpu: &Gpu) -> Self {
         if gpu.is_software() { Self::Narrow } else { Self::Wide }
+    }
+
+    /// Name of the stage that blends backward in this form.
+    pub fn backward_stage(self) -> &'static str {
+        match self {
+            Self::Wide => "rasterize_backward_wide",
+            Self::Narrow => "rasterize_backward_narrow",
+        }
     }
 
     /// Strips of 4×1 pixels per invocation.
@@ -90,7 +98,7 @@ pub fn wgsl_constants(form: BlendForm) -> String {
         ("SORT_BLOCK", SORT_BLOCK),
         ("SORT_CHUNK", SORT_CHUNK),
         ("VISIBLE_COUNTER", VISIBLE_COUNTER),
-        ("PAIR_COUNTER", PAIR_COUNTER),
+        ("INTERSECTION_COUNTER", INTERSECTION_COUNTER),
     ];
     let floats = floats.iter().map(|(name, value)| format!("const {name}: f32 = {value:e};\n"));
     let integers = integers.iter().map(|(name, value)| format!("const {name}: u32 = {value}u;\n"));
@@ -120,7 +128,7 @@ impl View {
             gaussian_count: 0,
             capacity: 0,
             sh_degree: 0,
-            pair_capacity: 0,
+            intersection_capacity: 0,
         }
     }
 
@@ -181,7 +189,7 @@ host_twins! {
         gaussian_count: u32,
         capacity: u32,
         sh_degree: u32,
-        pair_capacity: u32,
+        intersection_capacity: u32,
     }
     /// Counts made on the GPU, and the indirect dispatches that follow from them (`shaders/shared/counters.wgsl`).
     #[derive(Default)]
@@ -206,10 +214,10 @@ host_twins! {
         emit: u32,
         pad: [u32; 3],
     }
-    /// Which tiles a step leaves out (`shaders/select_tiles.wgsl`).
-    TileSkipSetup {
+    /// Which tiles a step samples (`shaders/sample_tiles.wgsl`).
+    TileSamplingSetup {
         share: f32,
-        least: f32,
+        min_share: f32,
         noise: f32,
         ssim_weight: f32,
         depth_weight: f32,
@@ -227,7 +235,7 @@ host_twins! {
         ssim_weight: f32,
         depth_weight: f32,
         precise_depth: f32,
-        depth_trust: f32,
+        depth_confidence: f32,
     }
     /// What counts as a wrong pixel (`shaders/rasterize_scores.wgsl`).
     ScoreSetup {

@@ -11,4 +11,4 @@ pub use cloud::{CloudState, GpuCloud, cloud_from_planes};
 pub use layout::BlendForm;
 pub use rasterizer::{PreparedView, Rasterizer, Rendered, ViewCounts};
 pub use shaders::{SHADERS, ShaderSource};
-pub use workspace::{Room, Workspace};
+pub use workspace::Capacities;

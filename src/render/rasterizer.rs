@@ -1,6 +1,6 @@
 //! Encodes the forward pass: project, compact, depth sort, tile lists, tile sort, blend.
 //!
-//! Nothing is read back in between: counts stay on the GPU and later dispatches take their size from them. When the pairs outgrow
+//! Nothing is read back in between: counts stay on the GPU and later dispatches take their size from them. When the intersections outgrow
 //! their buffers, the GPU renders nothing and says how many there are; the caller grows the buffers and repeats the step.
 
 use std::sync::Arc;
@@ -8,10 +8,10 @@ use std::sync::Arc;
 use bytemuck::Zeroable;
 
 use super::cloud::GpuCloud;
-use super::layout::{BlendForm, COUNTERS, Counter, PAIR_COUNTER, ScanSetup, TileListsSetup, VISIBLE_COUNTER, View};
+use super::layout::{BlendForm, COUNTERS, Counter, INTERSECTION_COUNTER, ScanSetup, TileListsSetup, VISIBLE_COUNTER, View};
 use super::shaders;
 use super::sort::{Scan, ScanJob, Sort};
-use super::workspace::{Room, Workspace};
+use super::workspace::{Capacities, Workspace};
 use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, workgroups};
 use crate::splat::{Exposure, ViewCamera};
 
@@ -51,7 +51,7 @@ impl Rendered {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ViewCounts {
     pub visible: u32,
-    pub pairs: u32,
+    pub intersections: u32,
 }
 
 #[derive(Debug)]
@@ -77,15 +77,15 @@ pub struct Rasterizer {
     // Written anew for each view. A write takes effect before the next submission, so one view at a time may be prepared.
     view: GpuBuffer,
     visible_scan: GpuBuffer,
-    pair_scan: GpuBuffer,
-    pub workspace: Workspace,
+    intersection_scan: GpuBuffer,
+    pub(crate) workspace: Workspace,
 }
 
-/// A view prepared for encoding, and where its sorted pairs will lie.
+/// A view prepared for encoding, and where its sorted intersections will lie.
 #[derive(Clone, Copy, Debug)]
 pub struct PreparedView {
     pub view: View,
-    /// Which of `workspace.slots` holds the sorted pairs.
+    /// Which of `workspace.slots` holds the sorted intersections.
     pub sorted: usize,
 }
 
@@ -117,7 +117,7 @@ impl Rasterizer {
             emit_mode: GpuBuffer::uniform(&gpu, "emit mode", &TileListsSetup { emit: 1, pad: [0; 3] })?,
             view: GpuBuffer::uniform(&gpu, "view", &View::zeroed())?,
             visible_scan: GpuBuffer::uniform(&gpu, "visible scan", &ScanSetup::zeroed())?,
-            pair_scan: GpuBuffer::uniform(&gpu, "pair scan", &ScanSetup::zeroed())?,
+            intersection_scan: GpuBuffer::uniform(&gpu, "intersection scan", &ScanSetup::zeroed())?,
             workspace: Workspace::new(&gpu)?,
             gpu,
         })
@@ -136,17 +136,17 @@ impl Rasterizer {
         self.form
     }
 
-    /// What the scratch buffers have room for.
-    pub fn room(&self) -> Room {
-        self.workspace.room()
+    /// Capacities of the scratch buffers.
+    pub fn capacities(&self) -> Capacities {
+        self.workspace.capacities()
     }
 
-    /// Makes as much room as another rasterizer had.
-    pub fn make(&mut self, room: Room) -> Result<(), GpuError> {
-        self.workspace.make(&self.gpu, room)
+    /// Reserves scratch buffers of the given capacities.
+    pub fn reserve(&mut self, capacities: Capacities) -> Result<(), GpuError> {
+        self.workspace.reserve(&self.gpu, capacities)
     }
 
-    /// Makes room for the view and tells the GPU of it; it must be submitted before another is prepared.
+    /// Reserves buffers for the view and uploads it; it must be submitted before another is prepared.
     pub fn prepare(&mut self, cloud: &GpuCloud, camera: &ViewCamera, background: [f32; 3]) -> Result<PreparedView, GpuError> {
         let mut view = View::new(camera, background);
         self.workspace.reserve_gaussians(&self.gpu, cloud.capacity())?;
@@ -155,19 +155,23 @@ impl Rasterizer {
         // All per-Gaussian buffers of the workspace are at least as long as the map's planes, whose stride both share.
         view.capacity = cloud.capacity() as u32;
         view.sh_degree = u32::from(cloud.sh_degree().get());
-        view.pair_capacity = self.workspace.pair_capacity as u32;
+        view.intersection_capacity = self.workspace.intersection_capacity as u32;
         let tile_bits = u32::BITS - view.tiles().leading_zeros();
         self.view.write(&self.gpu, 0, &[view]);
         let visible = ScanSetup::known(view.gaussian_count, VISIBLE_COUNTER, view.gaussian_count);
         self.visible_scan.write(&self.gpu, 0, &[visible]);
-        self.pair_scan.write(&self.gpu, 0, &[ScanSetup::counted(VISIBLE_COUNTER, PAIR_COUNTER, view.pair_capacity)]);
+        self.intersection_scan.write(
+            &self.gpu,
+            0,
+            &[ScanSetup::counted(VISIBLE_COUNTER, INTERSECTION_COUNTER, view.intersection_capacity)],
+        );
         Ok(PreparedView { view, sorted: (tile_bits.div_ceil(8) % 2) as usize })
     }
 
     /// Encodes what must precede the pass of [`Self::encode_forward`].
     pub fn encode_clear(&self, encoder: &mut wgpu::CommandEncoder) {
         encoder.clear_buffer(self.workspace.ranges.raw(), 0, None);
-        encoder.clear_buffer(self.workspace.skipped.raw(), 0, None);
+        encoder.clear_buffer(self.workspace.unsampled.raw(), 0, None);
         encoder.clear_buffer(self.workspace.counters.raw(), 0, None);
     }
 
@@ -177,7 +181,7 @@ impl Rasterizer {
         let (view, uniform) = (&prepared.view, &self.view);
         let count = view.gaussian_count;
         let per_gaussian = workgroups(count.div_ceil(256));
-        let project = [(0, uniform), (1, parameters), (2, &ws.projected), (3, &ws.visible), (4, &ws.skipped)];
+        let project = [(0, uniform), (1, parameters), (2, &ws.projected), (3, &ws.visible), (4, &ws.unsampled)];
         k.project_forward.dispatch(gpu, pass, &project, per_gaussian);
         let job = ScanJob { setup: &self.visible_scan, values: &ws.visible, prefix: &ws.prefix, bound: count };
         k.scan.encode(gpu, pass, ws, &job);
@@ -188,7 +192,7 @@ impl Rasterizer {
             (3, &ws.projected),
             (4, &ws.depth_keys[0]),
             (5, &ws.order[0]),
-            (6, &ws.pair_counts),
+            (6, &ws.intersection_counts),
         ];
         k.compact_visible.dispatch(gpu, pass, &compact, per_gaussian);
         k.sort.encode(gpu, pass, ws, (&ws.depth_keys, &ws.order), (VISIBLE_COUNTER, DEPTH_KEY_BITS));
@@ -216,48 +220,49 @@ impl Rasterizer {
                 (2, &ws.counters),
                 (3, &ws.order[0]),
                 (4, &ws.projected),
-                (5, &ws.pair_counts),
-                (6, &ws.pair_offsets),
+                (5, &ws.intersection_counts),
+                (6, &ws.intersection_offsets),
                 (7, &ws.tile_keys[0]),
                 (8, &ws.slots[0]),
                 (9, &ws.slot_gaussians),
-                (10, &ws.skipped),
+                (10, &ws.unsampled),
             ]
         };
         k.tile_lists.dispatch_indirect(gpu, pass, &lists(&self.count_mode), visible);
         let bound = prepared.view.gaussian_count;
-        let job = ScanJob { setup: &self.pair_scan, values: &ws.pair_counts, prefix: &ws.pair_offsets, bound };
+        let job =
+            ScanJob { setup: &self.intersection_scan, values: &ws.intersection_counts, prefix: &ws.intersection_offsets, bound };
         k.scan.encode(gpu, pass, ws, &job);
         k.tile_lists.dispatch_indirect(gpu, pass, &lists(&self.emit_mode), visible);
         let tile_bits = u32::BITS - prepared.view.tiles().leading_zeros();
-        let sorted = k.sort.encode(gpu, pass, ws, (&ws.tile_keys, &ws.slots), (PAIR_COUNTER, tile_bits));
+        let sorted = k.sort.encode(gpu, pass, ws, (&ws.tile_keys, &ws.slots), (INTERSECTION_COUNTER, tile_bits));
         debug_assert_eq!(sorted, prepared.sorted);
         let ranges = [(0, &ws.counters), (1, &ws.tile_keys[sorted]), (2, &ws.ranges)];
-        k.tile_ranges.dispatch_indirect(gpu, pass, &ranges, (&ws.counters, Counter::per_element_offset(PAIR_COUNTER)));
+        k.tile_ranges.dispatch_indirect(gpu, pass, &ranges, (&ws.counters, Counter::per_element_offset(INTERSECTION_COUNTER)));
         k.order_tiles.dispatch(gpu, pass, &[(0, &self.view), (1, &ws.ranges)], [1, 1, 1]);
     }
 
-    /// Reads the counters of the last view; when its pairs did not fit, grows the buffers and returns `None`: repeat the step.
+    /// Reads the counters of the last view; when its intersections did not fit, grows the buffers and returns `None`: repeat the step.
     pub fn finish(&mut self) -> Result<Option<ViewCounts>, GpuError> {
         let counters: Vec<Counter> = self.workspace.counters.read(&self.gpu, 0, COUNTERS as usize)?;
         let counts = self.counts(&counters);
-        self.make_room(&counters)?;
+        self.reserve_for(&counters)?;
         Ok(counts)
     }
 
-    /// What the counters of a view say; `None` where its pairs did not fit.
+    /// What the counters of a view say; `None` where its intersections did not fit.
     pub fn counts(&self, counters: &[Counter]) -> Option<ViewCounts> {
-        let pairs = counters[PAIR_COUNTER as usize];
-        let fits = pairs.count == pairs.needed;
-        fits.then(|| ViewCounts { visible: counters[VISIBLE_COUNTER as usize].count, pairs: pairs.count })
+        let intersections = counters[INTERSECTION_COUNTER as usize];
+        let fits = intersections.count == intersections.needed;
+        fits.then(|| ViewCounts { visible: counters[VISIBLE_COUNTER as usize].count, intersections: intersections.count })
     }
 
-    /// Grows the pair buffers to what the counters of a view ask for.
-    pub fn make_room(&mut self, counters: &[Counter]) -> Result<(), GpuError> {
-        let needed = counters[PAIR_COUNTER as usize].needed as usize;
-        if needed > self.workspace.pair_capacity {
-            tracing::debug!(pairs = needed, "making room for pairs");
-            self.workspace.reserve_pairs(&self.gpu, needed)?;
+    /// Enlarges the intersection buffers to what the counters of a view need.
+    pub fn reserve_for(&mut self, counters: &[Counter]) -> Result<(), GpuError> {
+        let needed = counters[INTERSECTION_COUNTER as usize].needed as usize;
+        if needed > self.workspace.intersection_capacity {
+            tracing::debug!(intersections = needed, "enlarging the intersection buffers");
+            self.workspace.reserve_intersections(&self.gpu, needed)?;
         }
         Ok(())
     }

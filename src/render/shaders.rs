@@ -23,7 +23,7 @@ const PROJECTION: &str = include_str!("../../shaders/shared/projection.wgsl");
 const HARMONICS: &str = include_str!("../../shaders/shared/spherical_harmonics.wgsl");
 const TILE: &str = include_str!("../../shaders/shared/tile.wgsl");
 const TILE_BACKWARD: &str = include_str!("../../shaders/shared/tile_backward.wgsl");
-const SKIPPED_TILES: &str = include_str!("../../shaders/shared/skipped_tiles.wgsl");
+const SAMPLED_TILES: &str = include_str!("../../shaders/shared/sampled_tiles.wgsl");
 const PIXEL_WINDOW: &str = include_str!("../../shaders/shared/pixel_window.wgsl");
 const SINK_GRADIENT: &str = include_str!("../../shaders/shared/sink_gradient.wgsl");
 const SINK_ADAM: &str = include_str!("../../shaders/shared/sink_adam.wgsl");
@@ -41,21 +41,21 @@ macro_rules! shaders {
 }
 
 shaders! {
-    PROJECT_FORWARD = "project_forward", "project_forward", [VIEW, PROJECTION, HARMONICS, SKIPPED_TILES], ["main"];
+    PROJECT_FORWARD = "project_forward", "project_forward", [VIEW, PROJECTION, HARMONICS, SAMPLED_TILES], ["main"];
     SCAN = "scan", "scan", [VIEW, COUNTERS], ["reduce", "sums", "apply"];
     COMPACT_VISIBLE = "compact_visible", "compact_visible", [VIEW], ["main"];
     SORT = "sort", "sort", [VIEW, COUNTERS], ["count_digits", "scan_digits", "scatter"];
-    TILE_LISTS = "tile_lists", "tile_lists", [VIEW, COUNTERS, SKIPPED_TILES], ["main"];
+    TILE_LISTS = "tile_lists", "tile_lists", [VIEW, COUNTERS, SAMPLED_TILES], ["main"];
     TILE_RANGES = "tile_ranges", "tile_ranges", [VIEW, COUNTERS], ["main"];
     ORDER_TILES = "order_tiles", "order_tiles", [VIEW], ["main"];
     RASTERIZE_FORWARD = "rasterize_forward", "rasterize_forward", [VIEW, TILE], ["main"];
-    SELECT_TILES = "select_tiles", "select_tiles", [VIEW], ["main"];
-    FILL_SKIPPED = "fill_skipped", "fill_skipped", [VIEW, SKIPPED_TILES], ["main"];
-    LOSS_FORWARD = "loss_forward", "loss_forward", [PIXEL_WINDOW, SKIPPED_TILES], ["main"];
-    LOSS_BACKWARD = "loss_backward", "loss_backward", [PIXEL_WINDOW, SKIPPED_TILES], ["main"];
+    SAMPLE_TILES = "sample_tiles", "sample_tiles", [VIEW], ["main"];
+    FILL_UNSAMPLED = "fill_unsampled", "fill_unsampled", [VIEW, SAMPLED_TILES], ["main"];
+    LOSS_FORWARD = "loss_forward", "loss_forward", [PIXEL_WINDOW, SAMPLED_TILES], ["main"];
+    LOSS_BACKWARD = "loss_backward", "loss_backward", [PIXEL_WINDOW, SAMPLED_TILES], ["main"];
     LOSS_REDUCE = "loss_reduce", "loss_reduce", [], ["main"];
-    RASTERIZE_BACKWARD_PIXELS = "rasterize_backward", "rasterize_backward_pixels", [VIEW, TILE, TILE_BACKWARD], ["main"];
-    RASTERIZE_BACKWARD_SPLATS = "rasterize_backward", "rasterize_backward_splats", [VIEW, TILE, TILE_BACKWARD], ["main"];
+    RASTERIZE_BACKWARD_NARROW = "rasterize_backward_narrow", "rasterize_backward_narrow", [VIEW, TILE, TILE_BACKWARD], ["main"];
+    RASTERIZE_BACKWARD_WIDE = "rasterize_backward_wide", "rasterize_backward_wide", [VIEW, TILE, TILE_BACKWARD], ["main"];
     RASTERIZE_SCORES = "rasterize_scores", "rasterize_scores", [VIEW, TILE, TILE_BACKWARD], ["main"];
     GATHER_SCORES = "gather_scores", "gather_scores", [VIEW, COUNTERS], ["main"];
     PROJECT_BACKWARD = "project_backward", "project_backward", [VIEW, COUNTERS, PROJECTION, HARMONICS, SINK_GRADIENT], ["main"];

@@ -8,7 +8,7 @@ use super::history::KeyframeRecord;
 use super::message_digest::MessageDigest;
 use crate::files::WriteError;
 use crate::gpu::Gpu;
-use crate::mapping::{Mapper, MapperMessage, RefinedPair, Refinement};
+use crate::mapping::{FinalRefinement, Mapper, MapperMessage, RefinedPair};
 use crate::recording::Recording;
 
 /// Path and interval of a run's checkpoints, and the part of its state that the mapper does not hold.
@@ -108,7 +108,7 @@ impl Checkpointer {
     pub(crate) fn finished_one(
         &mut self,
         mapper: &Mapper,
-        refinement: Option<&Refinement>,
+        refinement: Option<&FinalRefinement>,
         records: &[KeyframeRecord],
     ) -> Result<Option<usize>, CheckpointError> {
         self.since += 1;

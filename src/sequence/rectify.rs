@@ -17,6 +17,16 @@ pub struct RectifiedImage {
     pub depth: Option<DepthImage>,
 }
 
+impl RectifiedImage {
+    /// Median of the measured depths, metres; `None` if nothing was measured.
+    pub fn median_depth_metres(&self) -> Option<f64> {
+        let measured = self.depth.iter().flat_map(|depth| depth.metres.iter().copied().filter(|z| *z > 0.0));
+        let mut depths: Vec<f32> = measured.collect();
+        let middle = depths.len() / 2;
+        (!depths.is_empty()).then(|| f64::from(*depths.select_nth_unstable_by(middle, f32::total_cmp).1))
+    }
+}
+
 /// The precomputed map from mapping pixels to recorded pixels.
 #[derive(Clone, Debug)]
 pub struct Rectifier {

@@ -6,7 +6,7 @@ use fastrand::Rng;
 use image::RgbImage;
 use keysplat::geometry::Pinhole;
 use keysplat::gpu::Gpu;
-use keysplat::optimise::{AdamConfig, LossConfig, Optimiser, TargetImage, TrainingView};
+use keysplat::optimise::{AdamConfig, ImageGradients, LossConfig, TargetImage, Trainer, TrainingView};
 use keysplat::render::{BlendForm, GpuCloud, Rasterizer};
 use keysplat::splat::ViewCamera;
 use keysplat::splat::{GaussianCloud, ShDegree};
@@ -37,13 +37,9 @@ fn flat(cloud: &[Gaussian64]) -> Vec<f64> {
     cloud.iter().flat_map(Gaussian64::flat).collect()
 }
 
-/// A rasterizer of each form of the blending passes, with its optimiser.
-fn both_forms(gpu: &Arc<Gpu>) -> impl Iterator<Item = (Rasterizer, Optimiser)> {
-    BlendForm::ALL.into_iter().map(|form| {
-        let rasterizer = Rasterizer::with_form(gpu.clone(), form).unwrap();
-        let optimiser = Optimiser::new(&rasterizer).unwrap();
-        (rasterizer, optimiser)
-    })
+/// A rasterizer of each form of the blending passes, with its trainer.
+fn both_forms(gpu: &Arc<Gpu>) -> impl Iterator<Item = Trainer> {
+    BlendForm::ALL.into_iter().map(|form| Trainer::with_form(gpu.clone(), form).unwrap())
 }
 
 /// Renders on both and compares the images; returns the oracle's.
@@ -51,11 +47,11 @@ fn compare_images(gpu: &Arc<Gpu>, cloud: &GaussianCloud, camera: &ViewCamera) ->
     let expected = rasterize_forward::render(&view64(camera), &cloud64(cloud));
     let colors = expected.color.iter().zip(&expected.depth).flat_map(|(c, d)| [c.x, c.y, c.z, *d]);
     let wanted: Vec<f64> = colors.chain(expected.transmittance.iter().copied()).collect();
-    for (mut rasterizer, _) in both_forms(gpu) {
-        let rendered = rasterizer.render(&upload(gpu, cloud), camera, BACKGROUND).unwrap();
+    for mut trainer in both_forms(gpu) {
+        let rendered = trainer.render(&upload(gpu, cloud), camera, BACKGROUND).unwrap();
         let got: Vec<f64> = rendered.color_depth.iter().flatten().chain(&rendered.transmittance).map(|v| f64::from(*v)).collect();
         let error = crate::common::relative_error(&got, &wanted);
-        assert!(error < IMAGE_TOLERANCE, "image, {:?}: {error:e}", rasterizer.form());
+        assert!(error < IMAGE_TOLERANCE, "image, {:?}: {error:e}", trainer.form());
     }
     expected
 }
@@ -64,15 +60,15 @@ fn compare_images(gpu: &Arc<Gpu>, cloud: &GaussianCloud, camera: &ViewCamera) ->
 fn compare_gradients(gpu: &Arc<Gpu>, cloud: &GaussianCloud, camera: &ViewCamera, rng: &mut Rng) {
     let pixels = (camera.pinhole.width * camera.pinhole.height) as usize;
     let by_image = crate::common::image_gradient(rng, pixels);
-    let narrow: Vec<[f32; 4]> =
+    let color_depth =
         by_image.color.iter().zip(&by_image.depth).map(|(c, d)| [c.x as f32, c.y as f32, c.z as f32, *d as f32]).collect();
-    let alpha: Vec<f32> = by_image.alpha.iter().map(|a| *a as f32).collect();
+    let alpha = by_image.alpha.iter().map(|a| *a as f32).collect();
+    let by = ImageGradients { color_depth, alpha };
     let expected = backward(&view64(camera), &cloud64(cloud), &by_image);
     let wanted = flat(&expected.cloud);
-    for (mut rasterizer, mut optimiser) in both_forms(gpu) {
-        let form = rasterizer.form();
-        let got =
-            optimiser.gradients_from_image(&mut rasterizer, &upload(gpu, cloud), camera, BACKGROUND, (&narrow, &alpha)).unwrap();
+    for mut trainer in both_forms(gpu) {
+        let form = trainer.form();
+        let got = trainer.gradients_from_image(&upload(gpu, cloud), camera, BACKGROUND, &by).unwrap();
         let got_flat = flat(&cloud64(&got.cloud));
         assert!(got_flat.iter().all(|v| v.is_finite()), "a gradient is not finite");
         let error = crate::common::relative_error(&got_flat, &wanted);
@@ -127,11 +123,10 @@ fn the_loss_and_its_whole_gradient_agree() {
         let camera = crate::common::camera(&mut rng, 53, 37);
         let cloud = crate::common::scene(&mut rng, 200, ShDegree::ALL[(seed % 4) as usize]);
         let (image, wide) = target(&mut rng, camera.pinhole);
-        let mut rasterizer = Rasterizer::new(gpu.clone()).unwrap();
-        let mut optimiser = Optimiser::new(&rasterizer).unwrap();
+        let mut trainer = Trainer::new(gpu.clone()).unwrap();
         let on_gpu = upload(&gpu, &cloud);
         let image = upload_target(&gpu, &image, &wide);
-        let got = optimiser.gradients(&mut rasterizer, &on_gpu, &camera, &image, &config).unwrap();
+        let got = trainer.gradients(&on_gpu, &camera, &image, &config).unwrap();
         let view = View64 { background: Vector3::zeros(), ..view64(&camera) };
         let rendered = rasterize_forward::render(&view, &cloud64(&cloud));
         let weights = LossWeights {
@@ -156,7 +151,7 @@ fn the_loss_and_its_whole_gradient_agree() {
 fn adam_steps_agree() {
     let Some(gpu) = adapter() else { return };
     let loss = LossConfig::default();
-    let adam = AdamConfig { harmonics_every: 1, color_settling_steps: 2.0, averaged_steps: 1.5, ..AdamConfig::default() };
+    let adam = AdamConfig { harmonics_every: 1, color_settling_steps: 2.0, ema_steps: 1.5, ..AdamConfig::default() };
     let mut rng = Rng::with_seed(11);
     let camera = crate::common::camera(&mut rng, 48, 32);
     let mut cloud = crate::common::scene(&mut rng, 60, ShDegree::ALL[1]);
@@ -164,22 +159,21 @@ fn adam_steps_agree() {
     cloud.means[5].z = -1.0;
     let (image, wide) = target(&mut rng, camera.pinhole);
     let image = upload_target(&gpu, &image, &wide);
-    let mut rasterizer = Rasterizer::new(gpu.clone()).unwrap();
-    let mut optimiser = Optimiser::new(&rasterizer).unwrap();
+    let mut trainer = Trainer::new(gpu.clone()).unwrap();
     let on_gpu = upload(&gpu, &cloud);
     let mut expected: Vec<Vec<f64>> = cloud64(&cloud).iter().map(Gaussian64::flat).collect();
     let mut states = vec![Adam64::default(); cloud.len()];
     for _ in 0..4 {
-        let gradients = optimiser.gradients(&mut rasterizer, &on_gpu, &camera, &image, &loss).unwrap();
+        let gradients = trainer.gradients(&on_gpu, &camera, &image, &loss).unwrap();
         for (i, gradient) in cloud64(&gradients.cloud).iter().enumerate() {
             let size = (expected[i][3..6].iter().sum::<f64>() / 3.0).exp();
-            let mut rates = vec![f64::from(adam.position_rate) * size; 3];
-            rates.extend([f64::from(adam.scale_rate); 3]);
-            rates.extend([f64::from(adam.rotation_rate); 4]);
-            rates.push(f64::from(adam.opacity_rate));
+            let mut rates = vec![f64::from(adam.lr_position) * size; 3];
+            rates.extend([f64::from(adam.lr_log_scale); 3]);
+            rates.extend([f64::from(adam.lr_rotation); 4]);
+            rates.push(f64::from(adam.lr_opacity));
             let pace = (1.0 + f64::from(states[i].steps + 1) / 2.0).sqrt().recip();
-            rates.extend([f64::from(adam.color_rate) * pace; 3]);
-            rates.extend([f64::from(adam.harmonics_rate) * pace; 9]);
+            rates.extend([f64::from(adam.lr_color) * pace; 3]);
+            rates.extend([f64::from(adam.lr_harmonics) * pace; 9]);
             let decay = (f64::from(adam.beta_1), f64::from(adam.beta_2), f64::from(adam.epsilon));
             let before = states[i].steps;
             states[i].step(&mut expected[i], &gradient.flat(), &rates, decay);
@@ -188,7 +182,7 @@ fn adam_steps_agree() {
             }
         }
         let view = TrainingView::new(camera, &image);
-        optimiser.steps(&mut rasterizer, &on_gpu, &[view], (&loss, &adam)).unwrap();
+        trainer.steps(&on_gpu, &[view], &loss, &adam).unwrap();
     }
     let moved = on_gpu.download(&gpu).unwrap();
     let start = flat(&cloud64(&cloud));
@@ -269,13 +263,12 @@ fn depth_that_is_trusted_by_a_quarter_counts_as_if_it_had_a_quarter_of_the_weigh
     let cloud = crate::common::scene(&mut rng, 200, ShDegree::default());
     let (image, wide) = target(&mut rng, camera.pinhole);
     let image = upload_target(&gpu, &image, &wide);
-    let learn = |depth_trust: f32, depth_weight: f32| {
-        let mut rasterizer = Rasterizer::new(gpu.clone()).unwrap();
+    let learn = |depth_confidence: f32, depth_weight: f32| {
+        let mut trainer = Trainer::new(gpu.clone()).unwrap();
         let on_gpu = upload(&gpu, &cloud);
-        let views = [TrainingView { depth_trust, ..TrainingView::new(camera, &image) }; 5];
+        let views = [TrainingView { depth_confidence, ..TrainingView::new(camera, &image) }; 5];
         let loss = LossConfig { depth_weight, ..LossConfig::default() };
-        let configs = (&loss, &AdamConfig::default());
-        let reports = Optimiser::new(&rasterizer).unwrap().steps(&mut rasterizer, &on_gpu, &views, configs).unwrap();
+        let reports = trainer.steps(&on_gpu, &views, &loss, &AdamConfig::default()).unwrap();
         (on_gpu.download(&gpu).unwrap(), reports[4].loss.total(&loss))
     };
     let (trusted, weighted, whole) = (learn(0.25, 0.8), learn(1.0, 0.2), learn(1.0, 0.8));
@@ -297,16 +290,16 @@ fn pairs_that_outgrow_their_buffers_are_never_dropped() {
     // 400 Gaussians over most of 1200 tiles: more than the first buffers hold.
     let first = rasterizer.render(&on_gpu, &camera, BACKGROUND).unwrap();
     let counts = rasterizer.finish().unwrap().unwrap();
-    assert!(counts.pairs > 131_072, "the scene does not overflow: {counts:?}");
+    assert!(counts.intersections > 131_072, "the scene does not overflow: {counts:?}");
     assert_eq!(first, rasterizer.render(&on_gpu, &camera, BACKGROUND).unwrap(), "rendering is repeatable to the bit");
 
     // Training: steps that did not fit are repeated, and all of them count.
     let (image, wide) = target(&mut rng, camera.pinhole);
     let image = upload_target(&gpu, &image, &wide);
-    let mut rasterizer = Rasterizer::new(gpu.clone()).unwrap();
+    let mut trainer = Trainer::new(gpu.clone()).unwrap();
     let views = [TrainingView::new(camera, &image); 3];
-    let configs = (&LossConfig::default(), &AdamConfig::default());
-    let reports = Optimiser::new(&rasterizer).unwrap().steps(&mut rasterizer, &on_gpu, &views, configs).unwrap();
-    assert!(reports.iter().all(|r| r.counts.pairs > 131_072 && r.loss.l1 > 0.0), "{reports:?}");
-    assert!(reports[2].loss.total(configs.0) < reports[0].loss.total(configs.0), "the steps did not descend");
+    let loss = LossConfig::default();
+    let reports = trainer.steps(&on_gpu, &views, &loss, &AdamConfig::default()).unwrap();
+    assert!(reports.iter().all(|r| r.counts.intersections > 131_072 && r.loss.l1 > 0.0), "{reports:?}");
+    assert!(reports[2].loss.total(&loss) < reports[0].loss.total(&loss), "the steps did not descend");
 }

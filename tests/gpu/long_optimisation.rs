@@ -4,8 +4,8 @@
 use fastrand::Rng;
 use glam::Vec3;
 use image::{Rgb, RgbImage};
-use keysplat::optimise::{AdamConfig, LossConfig, Optimiser, TargetImage, TileSkip, TrainingView};
-use keysplat::render::{GpuCloud, Rasterizer};
+use keysplat::optimise::{AdamConfig, LossConfig, TargetImage, TileSampling, Trainer, TrainingView};
+use keysplat::render::GpuCloud;
 use keysplat::splat::ShDegree;
 
 const SCENES: u64 = 12;
@@ -23,8 +23,7 @@ fn elongation(log_scale: Vec3) -> f32 {
 fn two_hundred_steps_on_noise_end_finite() {
     let Some(gpu) = crate::common::requirements::adapter() else { return };
     let adam = AdamConfig::default();
-    let mut rasterizer = Rasterizer::new(gpu.clone()).unwrap();
-    let mut optimiser = Optimiser::new(&rasterizer).unwrap();
+    let mut trainer = Trainer::new(gpu.clone()).unwrap();
     let mut blunted = 0;
     for seed in 0..SCENES {
         let mut rng = Rng::with_seed(900 + seed);
@@ -41,11 +40,11 @@ fn two_hundred_steps_on_noise_end_finite() {
         let depth: Vec<f32> =
             (0..48 * 32).map(|_| if rng.f32() < 0.2 { 0.0 } else { crate::common::between(&mut rng, 0.05, 60.0) }).collect();
         let target = TargetImage::new(&gpu, &image, Some(&depth)).unwrap();
-        let skip = (seed % 2 == 1).then_some(TileSkip { share: 0.5, least: 0.1, noise: 0.0 });
-        let view = TrainingView { skip, ..TrainingView::new(camera, &target) };
+        let skip = (seed % 2 == 1).then_some(TileSampling { share: 0.5, min_share: 0.1, noise: 0.0 });
+        let view = TrainingView { tile_sampling: skip, ..TrainingView::new(camera, &target) };
         let mut losses = Vec::new();
         for _ in 0..STEPS / BATCH {
-            let reports = optimiser.steps(&mut rasterizer, &on_gpu, &[view; BATCH], (&LossConfig::default(), &adam)).unwrap();
+            let reports = trainer.steps(&on_gpu, &[view; BATCH], &LossConfig::default(), &adam).unwrap();
             losses.extend(reports.iter().map(|r| r.loss.total(&LossConfig::default())));
             assert!(reports.iter().all(|r| r.pose.iter().all(|v| v.is_finite())), "scene {seed}: pose gradient");
         }
@@ -62,7 +61,7 @@ fn two_hundred_steps_on_noise_end_finite() {
             assert!(finite, "scene {seed}, Gaussian {i}: {now:?}");
             // Adam moves a log scale by no more than about its rate a step.
             let growth = (now.log_scale - before.log_scale).max_element();
-            assert!(growth < 1.5 * STEPS as f32 * adam.scale_rate, "scene {seed}, Gaussian {i} grew by e^{growth}");
+            assert!(growth < 1.5 * STEPS as f32 * adam.lr_log_scale, "scene {seed}, Gaussian {i} grew by e^{growth}");
             if now != before {
                 let limit = adam.max_elongation * 1.001;
                 assert!(elongation(now.log_scale) <= limit, "scene {seed}, Gaussian {i} is a needle: {:?}", now.log_scale);

@@ -25,7 +25,7 @@ fn density_is_controlled_after_every_so_many_keyframes() {
     let Some(gpu) = adapter() else { return };
     for every in [1, 2, 3] {
         let mut config = MappingConfig { first_iterations: 5, iterations_per_keyframe: 5, ..Default::default() };
-        // No seed is as opaque as this.
+        // No inserted Gaussian is as opaque as this.
         (config.density.every, config.density.min_opacity) = (every, 0.95);
         let mut mapper = Mapper::new(gpu.clone(), &config).unwrap();
         for id in 0..6 {
@@ -37,7 +37,7 @@ fn density_is_controlled_after_every_so_many_keyframes() {
     }
 }
 
-/// Each keyframe shows another place, so there is always more to seed.
+/// Each keyframe shows another place, so there is always more to insert.
 #[test]
 fn memory_is_held_however_much_there_is_to_map() {
     let Some(free) = adapter() else { return };
@@ -79,11 +79,11 @@ fn keyframes_before_the_first_depth_are_passed_over() {
     let resumed = resume(&mapper.state(None).unwrap(), &[keyframe(0, false), keyframe(1, false)]);
     assert!(resumed.has_not_begun());
     let begun = mapper.insert(&keyframe(2, true), &|| false).unwrap();
-    assert!(begun.seeded > 0 && begun.iterations == 5, "{begun:?}");
+    assert!(begun.inserted > 0 && begun.iterations == 5, "{begun:?}");
     let mut resumed = resume(&mapper.state(None).unwrap(), &[keyframe(0, false), keyframe(1, false), keyframe(2, true)]);
     resumed.insert(&keyframe(3, true), &|| false).unwrap();
     mapper.insert(&keyframe(3, true), &|| false).unwrap();
     assert_eq!(mapper.download().unwrap(), resumed.download().unwrap());
     let after = mapper.insert(&keyframe(4, false), &|| false).unwrap();
-    assert!(after.seeded == 0 && after.iterations > 0 && after.gaussians > 0, "{after:?}");
+    assert!(after.inserted == 0 && after.iterations > 0 && after.gaussians > 0, "{after:?}");
 }

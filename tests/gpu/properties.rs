@@ -5,8 +5,8 @@ use std::sync::{Arc, Mutex, OnceLock};
 
 use fastrand::Rng;
 use keysplat::gpu::Gpu;
-use keysplat::optimise::Optimiser;
-use keysplat::render::{BlendForm, GpuCloud, Rasterizer};
+use keysplat::optimise::{ImageGradients, Trainer};
+use keysplat::render::{BlendForm, GpuCloud};
 use keysplat::splat::{Gaussian, GaussianCloud, ShDegree};
 use keysplat::verification::reference::project_backward::backward;
 use keysplat::verification::reference::rasterize_forward::Conditioning;
@@ -26,7 +26,7 @@ const HOPELESS: f64 = 3e-3;
 struct Machine {
     gpu: Arc<Gpu>,
     /// One of each form of the blending passes; they take turns.
-    forms: Vec<(Rasterizer, Optimiser)>,
+    forms: Vec<Trainer>,
 }
 
 /// One device for all cases; `None`, said once, without an adapter.
@@ -34,11 +34,7 @@ fn machine() -> Option<&'static Mutex<Machine>> {
     static MACHINE: OnceLock<Result<Mutex<Machine>, String>> = OnceLock::new();
     let machine = MACHINE.get_or_init(|| match Gpu::open(None) {
         Ok(gpu) => {
-            let form = |&form| {
-                let rasterizer = Rasterizer::with_form(gpu.clone(), form).unwrap();
-                let optimiser = Optimiser::new(&rasterizer).unwrap();
-                (rasterizer, optimiser)
-            };
+            let form = |&form| Trainer::with_form(gpu.clone(), form).unwrap();
             let forms = BlendForm::ALL.iter().map(form).collect();
             Ok(Mutex::new(Machine { gpu, forms }))
         }
@@ -92,7 +88,7 @@ fn check(seed: u64, faults: &[(u8, f32)]) -> Result<(), TestCaseError> {
     let Some(machine) = machine() else { return Ok(()) };
     let mut machine = machine.lock().unwrap();
     let Machine { gpu, forms } = &mut *machine;
-    let (rasterizer, optimiser) = &mut forms[seed as usize % 2];
+    let trainer = &mut forms[seed as usize % 2];
     let (view, cloud) = scene(seed, faults);
     let wide = cloud64(&cloud);
     let mut on_gpu = GpuCloud::new(gpu, cloud.sh_degree, cloud.len()).unwrap();
@@ -105,7 +101,7 @@ fn check(seed: u64, faults: &[(u8, f32)]) -> Result<(), TestCaseError> {
         _ => BAND_TOLERANCE,
     };
 
-    let rendered = rasterizer.render(&on_gpu, &view.camera, background).unwrap();
+    let rendered = trainer.render(&on_gpu, &view.camera, background).unwrap();
     let expected = rasterize_forward::render(&view, &wide);
     let got: Vec<f64> = rendered.color_depth.iter().flatten().chain(&rendered.transmittance).map(|v| f64::from(*v)).collect();
     prop_assert!(got.iter().all(|v| v.is_finite()), "the image is not finite");
@@ -115,7 +111,7 @@ fn check(seed: u64, faults: &[(u8, f32)]) -> Result<(), TestCaseError> {
     prop_assert!(error < tolerance, "image: {error:e}, {judged:?}");
 
     let by_image = crate::common::image_gradient(&mut Rng::with_seed(seed), (SIZE.0 * SIZE.1) as usize);
-    let by_color: Vec<[f32; 4]> = by_image
+    let color_depth = by_image
         .color
         .iter()
         .zip(&by_image.depth)
@@ -124,8 +120,9 @@ fn check(seed: u64, faults: &[(u8, f32)]) -> Result<(), TestCaseError> {
             [r, g, b, *d as f32]
         })
         .collect();
-    let by_alpha: Vec<f32> = by_image.alpha.iter().map(|a| *a as f32).collect();
-    let got = optimiser.gradients_from_image(rasterizer, &on_gpu, &view.camera, background, (&by_color, &by_alpha)).unwrap();
+    let alpha = by_image.alpha.iter().map(|a| *a as f32).collect();
+    let by = ImageGradients { color_depth, alpha };
+    let got = trainer.gradients_from_image(&on_gpu, &view.camera, background, &by).unwrap();
     let flat: Vec<f64> = cloud64(&got.cloud).iter().flat_map(Gaussian64::flat).collect();
     prop_assert!(flat.iter().all(|v| v.is_finite()) && got.pose.iter().all(|v| v.is_finite()), "a gradient is not finite");
     let expected: Vec<f64> = backward(&view, &wide, &by_image).cloud.iter().flat_map(Gaussian64::flat).collect();
@@ -148,7 +145,7 @@ proptest! {
         let Some(machine) = machine() else { return Ok(()) };
         let mut machine = machine.lock().unwrap();
         let Machine { gpu, forms } = &mut *machine;
-        let (rasterizer, _) = &mut forms[seed as usize % 2];
+        let trainer = &mut forms[seed as usize % 2];
         let (view, cloud) = scene(seed, &[(99, 0.0); 40]);
         let mut on_gpu = GpuCloud::new(gpu, cloud.sh_degree, cloud.len()).unwrap();
         on_gpu.append(gpu, &cloud).unwrap();
@@ -156,7 +153,7 @@ proptest! {
             let value = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY][*value];
             on_gpu.parameters().write(gpu, plane * on_gpu.capacity() + i, &[[value; 4]]);
         }
-        let rendered = rasterizer.render(&on_gpu, &view.camera, [0.0; 3]).unwrap();
+        let rendered = trainer.render(&on_gpu, &view.camera, [0.0; 3]).unwrap();
         prop_assert!(rendered.color_depth.iter().flatten().chain(&rendered.transmittance).all(|v| v.is_finite()));
     }
 }

@@ -83,7 +83,7 @@ fn error(keyframe: usize, other: usize, keyframe_from_other: &Se3) -> (f64, f64)
 fn a_disturbed_keyframe_returns_to_the_truth() {
     let Some(gpu) = crate::common::requirements::adapter() else { return };
     let off = RefinePosesConfig::default();
-    let on = RefinePosesConfig { enabled: true, rotation_rate: 3e-4, translation_rate: 6e-4, pull: 0.0, ..off.clone() };
+    let on = RefinePosesConfig { enabled: true, lr_rotation: 3e-4, lr_translation: 6e-4, pull: 0.0, ..off.clone() };
     assert!(refined(&gpu, RefinePosesConfig { enabled: false, ..off }).0.is_empty());
     let (pairs, map) = refined(&gpu, on.clone());
     assert!(pairs.len() >= 4, "{pairs:?}");

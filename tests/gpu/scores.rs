@@ -2,8 +2,8 @@
 
 use fastrand::Rng;
 use image::{Rgb, RgbImage};
-use keysplat::optimise::{AdamConfig, LossConfig, Optimiser, TargetImage, TrainingView, WrongPixels};
-use keysplat::render::{BlendForm, GpuCloud, Rasterizer};
+use keysplat::optimise::{AdamConfig, LossConfig, TargetImage, Trainer, TrainingView, WrongPixels};
+use keysplat::render::{BlendForm, GpuCloud};
 use keysplat::splat::ShDegree;
 use keysplat::verification::reference::loss::{LossWeights, Target64, loss};
 use keysplat::verification::reference::scores::scores;
@@ -39,17 +39,16 @@ fn scores_are_those_of_their_definition() {
         let (total, by_image) = loss(&rendered, &target, &weights);
         let expected = scores(&view, &cloud_64, &by_image, &wrong);
 
-        let mut rasterizer = Rasterizer::with_form(gpu.clone(), form).unwrap();
-        let mut optimiser = Optimiser::new(&rasterizer).unwrap();
+        let mut trainer = Trainer::with_form(gpu.clone(), form).unwrap();
         let mut on_gpu = GpuCloud::new(&gpu, cloud.sh_degree, cloud.len()).unwrap();
         on_gpu.append(&gpu, &cloud).unwrap();
         let target = TargetImage::new(&gpu, &image, None).unwrap();
         let view = TrainingView { scored: Some(wrong_config), ..TrainingView::new(camera, &target) };
-        optimiser.begin_scores(&gpu, &on_gpu).unwrap();
+        trainer.begin_scores(&on_gpu).unwrap();
         // Nothing moves, so that both views score the same map.
         let still = AdamConfig::default().scaled(0.0, 0.0);
-        optimiser.steps(&mut rasterizer, &on_gpu, &[view; 2], (&loss_config, &still)).unwrap();
-        let found = optimiser.read_scores(&gpu, &on_gpu).unwrap();
+        trainer.steps(&on_gpu, &[view; 2], &loss_config, &still).unwrap();
+        let found = trainer.read_scores(&on_gpu).unwrap();
 
         let compare = |name: &str, found: Vec<f32>, expected: Vec<f64>| {
             let found: Vec<f64> = found.into_iter().map(f64::from).collect();

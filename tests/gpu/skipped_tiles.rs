@@ -4,13 +4,13 @@ use fastrand::Rng;
 use glam::Vec3;
 use image::{Rgb, RgbImage};
 use keysplat::gpu::Gpu;
-use keysplat::optimise::{AdamConfig, LossConfig, Optimiser, StepReport, TargetImage, TileSkip, TrainingView};
+use keysplat::optimise::{AdamConfig, LossConfig, StepReport, TargetImage, TileSampling, Trainer, TrainingView};
 use keysplat::render::{BlendForm, GpuCloud, Rasterizer};
 use keysplat::splat::{GaussianCloud, ShDegree};
 
 const LOSS: LossConfig = LossConfig { ssim_weight: 0.2, depth_weight: 0.0, precise_depth_metres: 2.0 };
 /// Tiles below the noise never, all others always.
-const NOISE_ONLY: TileSkip = TileSkip { share: 1e6, least: 0.0, noise: 0.02 };
+const NOISE_ONLY: TileSampling = TileSampling { share: 1e6, min_share: 0.0, noise: 0.02 };
 const WIDTH: u32 = 128;
 /// SSIM's windows carry the right half's error into the nearest column of tiles of the left half: pixels.
 const WORKED: f64 = 16.0;
@@ -27,17 +27,16 @@ struct Steps<'a> {
 
 impl Steps<'_> {
     /// The map after a step of each kind, one after the other on the same target, and what they reported. The first moves nothing.
-    fn run(&self, skips: &[Option<TileSkip>]) -> (GaussianCloud, Vec<StepReport>) {
-        let mut rasterizer = Rasterizer::with_form(self.gpu.clone(), self.form).unwrap();
-        let mut optimiser = Optimiser::new(&rasterizer).unwrap();
+    fn run(&self, skips: &[Option<TileSampling>]) -> (GaussianCloud, Vec<StepReport>) {
+        let mut trainer = Trainer::with_form(self.gpu.clone(), self.form).unwrap();
         let mut on_gpu = GpuCloud::new(&self.gpu, self.cloud.sh_degree, self.cloud.len()).unwrap();
         on_gpu.append(&self.gpu, self.cloud).unwrap();
         let target = TargetImage::new(&self.gpu, self.image, None).unwrap();
         let mut reports = Vec::new();
         for (i, skip) in skips.iter().enumerate() {
-            let pace = if i == 0 { 0.0 } else { 1.0 };
-            let view = TrainingView { pace, skip: *skip, ..TrainingView::new(self.camera, &target) };
-            reports.extend(optimiser.steps(&mut rasterizer, &on_gpu, &[view], (&LOSS, &AdamConfig::default())).unwrap());
+            let lr_scale = if i == 0 { 0.0 } else { 1.0 };
+            let view = TrainingView { lr_scale, tile_sampling: *skip, ..TrainingView::new(self.camera, &target) };
+            reports.extend(trainer.steps(&on_gpu, &[view], &LOSS, &AdamConfig::default()).unwrap());
         }
         (on_gpu.download(&self.gpu).unwrap(), reports)
     }
@@ -69,7 +68,7 @@ fn a_tile_below_the_noise_is_left_out_and_the_others_learn_as_before() {
         let (plain, plain_reports) = steps.run(&[None, None]);
         let (skipping, reports) = steps.run(&[Some(NOISE_ONLY), Some(NOISE_ONLY)]);
         assert_eq!(plain_reports[0], reports[0], "what was never seen is not left out");
-        assert!(reports[1].counts.pairs < plain_reports[1].counts.pairs * 7 / 10, "{:?}", reports[1].counts);
+        assert!(reports[1].counts.intersections < plain_reports[1].counts.intersections * 7 / 10, "{:?}", reports[1].counts);
         let psnr = [&plain_reports[1], &reports[1]].map(|r| r.loss.psnr_db());
         assert!((psnr[0] - psnr[1]).abs() < 0.01, "the loss of what was left out is remembered: {psnr:?}");
         let (mut still, mut same) = (0, 0);
@@ -100,9 +99,11 @@ fn every_tile_comes_up_now_and_then() {
     let cloud = crate::common::scene(&mut rng, 200, ShDegree::ALL[0]);
     let image = RgbImage::from_fn(WIDTH, 64, |x, _| Rgb([if x < WIDTH / 2 { 30 } else { rng.u8(..) }; 3]));
     let steps = Steps { gpu, form: BlendForm::Narrow, cloud: &cloud, camera, image: &image };
-    let skip = TileSkip { share: 0.4, least: 0.1, noise: 0.0 };
+    let skip = TileSampling { share: 0.4, min_share: 0.1, noise: 0.0 };
     let (moved, reports) = steps.run(&[Some(skip); 60]);
-    let mean = reports[1..].iter().map(|r| f64::from(r.counts.pairs)).sum::<f64>() / 59.0 / f64::from(reports[0].counts.pairs);
+    let mean = reports[1..].iter().map(|r| f64::from(r.counts.intersections)).sum::<f64>()
+        / 59.0
+        / f64::from(reports[0].counts.intersections);
     assert!((0.2..0.7).contains(&mean), "{mean} of the work was done");
     let (all, _) = steps.run(&[None; 60]);
     let moves = |to: &GaussianCloud| (0..cloud.len()).filter(|&i| to.means[i] != cloud.means[i]).count();

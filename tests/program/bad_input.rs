@@ -152,7 +152,7 @@ fn configurations() {
         ("map_scale = nan\n", "map_scale must be above 0 and at most 1, not NaN"),
         ("[replay]\nevery = 0\n", "replay.every must be at least 1"),
         ("[tracking]\nfeatures = 0\n", "tracking.features is 0; it must be from 100"),
-        ("[mapping.seeding]\nopacity = 1.5\n", "mapping.seeding.opacity must lie between 0 and 1, not 1.5"),
+        ("[mapping.insertion]\nopacity = 1.5\n", "mapping.insertion.opacity must lie between 0 and 1, not 1.5"),
     ] {
         let config = write("out-of-range.toml", text);
         run(&config).refused(&[&format!("{}: ", config.display()), part]);

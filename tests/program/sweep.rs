@@ -72,7 +72,7 @@ fn presets_are_swept_with_their_own_steps_or_with_all() {
     let all = csv_of(&["--presets", "quality", "--iterations", "2,3"]);
     assert!(all.lines().count() == 3 && all.contains("\"quality, 2 steps\""), "{all}");
     let few = settings("quality--3-steps-0");
-    assert_eq!((few.iterations_per_keyframe, few.seeding.detail), (3, quality.seeding.detail));
+    assert_eq!((few.iterations_per_keyframe, few.insertion.detail), (3, quality.insertion.detail));
 }
 
 #[test]

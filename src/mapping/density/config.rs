@@ -6,11 +6,11 @@ use crate::optimise::WrongPixels;
 
 /// How the map's density is controlled after each keyframe.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
+#[serde(rename_all = "snake_case")]
 pub enum DensityStrategy {
     /// Multi-view-consistent densification and pruning (FastGS, arXiv 2511.04283), over the keyframe window.
     #[default]
-    Vcd,
+    MultiView,
     /// By the gradient alone (3DGS, Kerbl et al. 2023).
     Classic,
     /// Seeds only.
@@ -32,14 +32,14 @@ pub struct DensityConfig {
     pub min_opacity: f32,
     /// Largest standard deviation, metres.
     pub max_scale_metres: f32,
-    pub vcd: VcdConfig,
+    pub multi_view: MultiViewConfig,
     pub classic: ClassicConfig,
 }
 
 /// Thresholds of multi-view-consistent density control.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-pub struct VcdConfig {
+pub struct MultiViewConfig {
     /// A pixel is wrong where its error exceeds the view's mean error this many times,
     pub error_ratio: f32,
     /// and this much: mean absolute colour error, 0 to 1.
@@ -57,7 +57,7 @@ pub struct VcdConfig {
     /// A Gaussian that never adds more than this to a pixel is removed.
     pub min_weight: f32,
     /// One that never adds more than this to a view is removed too: pixels.
-    pub min_worth: f32,
+    pub min_contribution: f32,
     /// Of the Gaussians below this opacity, the half with more wrong pixels is removed.
     pub faint_opacity: f32,
 }
@@ -81,13 +81,13 @@ impl Default for DensityConfig {
             after_share: 0.6,
             min_opacity: 0.03,
             max_scale_metres: 20.0,
-            vcd: VcdConfig::default(),
+            multi_view: MultiViewConfig::default(),
             classic: ClassicConfig::default(),
         }
     }
 }
 
-impl Default for VcdConfig {
+impl Default for MultiViewConfig {
     fn default() -> Self {
         Self {
             error_ratio: 1.5,
@@ -98,7 +98,7 @@ impl Default for VcdConfig {
             max_growth: 0.015,
             min_age: 2,
             min_weight: 0.02,
-            min_worth: 1.5,
+            min_contribution: 1.5,
             faint_opacity: 0.1,
         }
     }
@@ -113,14 +113,14 @@ impl Default for ClassicConfig {
 impl DensityConfig {
     /// What counts as a wrong pixel when the Gaussians are scored.
     pub fn wrong_pixels(&self) -> WrongPixels {
-        let VcdConfig { error_ratio, noise, .. } = self.vcd;
+        let MultiViewConfig { error_ratio, noise, .. } = self.multi_view;
         WrongPixels { error_ratio, noise }
     }
 
     /// The same, but nothing is divided any more.
     pub fn without_growth(&self) -> Self {
         let mut still = self.clone();
-        (still.vcd.max_growth, still.classic.gradient) = (0.0, f32::MAX);
+        (still.multi_view.max_growth, still.classic.gradient) = (0.0, f32::MAX);
         still
     }
 
@@ -129,28 +129,28 @@ impl DensityConfig {
         if self.every == 0 || self.views == 0 {
             return Err("every and views must be at least 1".into());
         }
-        let (v, c) = (&self.vcd, &self.classic);
+        let (v, c) = (&self.multi_view, &self.classic);
         if !(0.0..=1.0).contains(&self.after_share) {
             return Err(format!("after_share must lie between 0 and 1, not {}", self.after_share));
         }
         let shares = [
             ("min_opacity", self.min_opacity),
-            ("vcd.min_weight", v.min_weight),
-            ("vcd.faint_opacity", v.faint_opacity),
-            ("vcd.noise", v.noise),
+            ("multi_view.min_weight", v.min_weight),
+            ("multi_view.faint_opacity", v.faint_opacity),
+            ("multi_view.noise", v.noise),
         ];
         if let Some((name, value)) = shares.iter().find(|(_, value)| !(0.0..1.0).contains(value)) {
             return Err(format!("{name} must lie between 0 and 1, not {value}"));
         }
         let positive = [
             ("max_scale_metres", self.max_scale_metres),
-            ("vcd.split_pixels", v.split_pixels),
+            ("multi_view.split_pixels", v.split_pixels),
             ("classic.split_pixels", c.split_pixels),
         ];
         if let Some((name, value)) = positive.iter().find(|(_, value)| !(value.is_finite() && *value > 0.0)) {
             return Err(format!("{name} must be positive, not {value}"));
         }
-        let thresholds = [v.error_ratio, v.wrong_pixels, v.absolute_gradient, v.max_growth, v.min_worth, c.gradient];
+        let thresholds = [v.error_ratio, v.wrong_pixels, v.absolute_gradient, v.max_growth, v.min_contribution, c.gradient];
         if thresholds.iter().any(|t| !(t.is_finite() && *t >= 0.0)) {
             return Err("thresholds must be finite and not negative".into());
         }

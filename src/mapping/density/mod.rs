@@ -1,13 +1,13 @@
 //! Density control: which Gaussians go, and which are divided. A strategy only returns a [`Plan`]; one pass applies it, prune before grow.
 
 mod classic;
-mod vcd;
+mod multi_view;
 
 use glam::{Quat, Vec3};
 
-pub use self::config::{ClassicConfig, DensityConfig, DensityStrategy, VcdConfig};
+pub use self::config::{ClassicConfig, DensityConfig, DensityStrategy, MultiViewConfig};
 
-use super::ledger::Entry;
+use super::gaussian_stats::GaussianHistory;
 use crate::optimise::GaussianScore;
 use crate::splat::{opacity_from_raw, raw_opacity_from_opacity};
 
@@ -22,7 +22,7 @@ pub(super) struct Candidate {
     /// World from Gaussian.
     pub rotation: Quat,
     pub score: GaussianScore,
-    pub entry: Entry,
+    pub history: GaussianHistory,
 }
 
 /// A new Gaussian: its parent with another place, size and opacity.
@@ -71,18 +71,18 @@ impl Candidate {
 /// Judges every Gaussian; those gone bad (NaN) are removed whatever the strategy. At most `most` are left, undivided ones first.
 pub(super) fn plan(candidates: &[Candidate], most: usize, config: &DensityConfig) -> Plan {
     let verdicts = match config.strategy {
-        DensityStrategy::Vcd => vcd::judge(candidates, &config.vcd),
+        DensityStrategy::MultiView => multi_view::judge(candidates, &config.multi_view),
         DensityStrategy::Classic => classic::judge(candidates, &config.classic),
         DensityStrategy::None => vec![Verdict::Keep; candidates.len()],
     };
     let mut plan = Plan::default();
     let mut room = most.saturating_sub(candidates.len());
     for (i, (candidate, verdict)) in (0..).zip(candidates.iter().zip(verdicts)) {
-        let worth = candidate.is_finite()
+        let valid = candidate.is_finite()
             && candidate.opacity() >= config.min_opacity
             && candidate.log_scale.max_element() <= config.max_scale_metres.ln();
         match verdict {
-            _ if !worth => {}
+            _ if !valid => {}
             Verdict::Remove => {}
             Verdict::Split | Verdict::Clone if room > 0 => {
                 plan.children.extend(divide(i, candidate, verdict == Verdict::Clone));
@@ -131,7 +131,7 @@ mod tests {
                 metres_per_pixel: 0.005,
                 ..GaussianScore::default()
             },
-            entry: Entry { age: 5, views: 12, best_weight: 0.5, worth: 20.0, anchor: 0 },
+            history: GaussianHistory { age: 5, views: 12, best_weight: 0.5, contribution: 20.0, anchor: 0 },
         }
     }
 
@@ -148,9 +148,12 @@ mod tests {
 
     #[test]
     fn vcd_divides_what_several_views_call_too_coarse_and_nothing_else() {
-        let config = DensityConfig { vcd: VcdConfig { max_growth: 1.0, ..VcdConfig::default() }, ..DensityConfig::default() };
+        let config = DensityConfig {
+            multi_view: MultiViewConfig { max_growth: 1.0, ..MultiViewConfig::default() },
+            ..DensityConfig::default()
+        };
         let fine = Candidate { log_scale: Vec3::splat(0.001f32.ln()), ..wrong() };
-        let young = Candidate { entry: Entry { age: 0, ..good().entry }, ..wrong() };
+        let young = Candidate { history: GaussianHistory { age: 0, ..good().history }, ..wrong() };
         let unseen = Candidate { score: GaussianScore::default(), ..wrong() };
         let plan = plan(&[good(), wrong(), fine, young, unseen], 100, &config);
         assert_eq!(plan.keep, [0, 2, 3, 4]);
@@ -164,9 +167,9 @@ mod tests {
     #[test]
     fn what_is_never_seen_and_what_went_bad_goes() {
         let config = DensityConfig::default();
-        let hidden = Candidate { entry: Entry { best_weight: 0.001, ..good().entry }, ..good() };
-        let speck = Candidate { entry: Entry { worth: 0.5, ..good().entry }, ..good() };
-        let new = Candidate { entry: Entry::default(), ..hidden };
+        let hidden = Candidate { history: GaussianHistory { best_weight: 0.001, ..good().history }, ..good() };
+        let speck = Candidate { history: GaussianHistory { contribution: 0.5, ..good().history }, ..good() };
+        let new = Candidate { history: GaussianHistory::default(), ..hidden };
         let nan = Candidate { mean: Vec3::NAN, ..good() };
         let faint = Candidate { raw_opacity: raw_opacity_from_opacity(0.01), ..good() };
         let huge = Candidate { log_scale: Vec3::splat(4.0), ..good() };
@@ -179,9 +182,9 @@ mod tests {
 
     #[test]
     fn no_strategy_grows_a_map_beyond_its_room() {
-        for strategy in [DensityStrategy::Vcd, DensityStrategy::Classic] {
-            let vcd = VcdConfig { max_growth: 1.0, ..VcdConfig::default() };
-            let config = DensityConfig { strategy, vcd, ..DensityConfig::default() };
+        for strategy in [DensityStrategy::MultiView, DensityStrategy::Classic] {
+            let multi_view = MultiViewConfig { max_growth: 1.0, ..MultiViewConfig::default() };
+            let config = DensityConfig { strategy, multi_view, ..DensityConfig::default() };
             let plan = plan(&[wrong(); 10], 13, &config);
             assert_eq!((plan.keep.len(), plan.children.len()), (7, 6));
         }

@@ -1,4 +1,4 @@
-//! Refinement over all keyframes, after the last one: steps at half size first, then at full size, with density control in between.
+//! FinalRefinement over all keyframes, after the last one: steps at half size first, then at full size, with density control in between.
 //!
 //! Each epoch draws every keyframe once, in a seeded shuffle. Rates fall exponentially, as 3DGS has it for positions.
 
@@ -11,7 +11,7 @@ use super::{BATCH, Mapper, MappingError, Step};
 
 /// Where a refinement stands; begun by [`Mapper::begin_refinement`].
 #[derive(Clone, Debug, Serialize, Deserialize)]
-pub struct Refinement {
+pub struct FinalRefinement {
     config: RefineConfig,
     /// Rates at the beginning.
     adam: AdamConfig,
@@ -33,7 +33,7 @@ pub struct RefineReport {
     pub psnr_db: f32,
 }
 
-impl Refinement {
+impl FinalRefinement {
     /// Share of the steps that are done, 0 to 1.
     fn progress(&self) -> f32 {
         self.done as f32 / self.config.steps.max(1) as f32
@@ -42,20 +42,24 @@ impl Refinement {
     /// The rates for the next step.
     fn rates(&self) -> AdamConfig {
         let fallen = |to: f32| to.powf(self.progress());
-        self.adam.scaled(fallen(self.config.final_position_rate), fallen(self.config.final_rate))
+        self.adam.scaled(fallen(self.config.final_lr_scale_position), fallen(self.config.final_lr_scale))
     }
 }
 
 impl Mapper {
     /// Begins a refinement over the keyframes so far; none may come until it is done.
-    pub fn begin_refinement(&mut self) -> Result<Refinement, MappingError> {
+    pub fn begin_refinement(&mut self) -> Result<FinalRefinement, MappingError> {
         let config = self.config.refine.clone();
         self.config.density.views = config.density_views;
-        Ok(Refinement { adam: self.config.adam.clone(), config, done: 0, epoch: Vec::new(), rounds: 0 })
+        Ok(FinalRefinement { adam: self.config.adam.clone(), config, done: 0, epoch: Vec::new(), rounds: 0 })
     }
 
     /// The steps up to the next density control, and that; `None` when all are done, or `stop` says so.
-    pub fn refine(&mut self, refinement: &mut Refinement, stop: &dyn Fn() -> bool) -> Result<Option<RefineReport>, MappingError> {
+    pub fn refine(
+        &mut self,
+        refinement: &mut FinalRefinement,
+        stop: &dyn Fn() -> bool,
+    ) -> Result<Option<RefineReport>, MappingError> {
         let RefineConfig { steps, density_every, growth_share, half_size_share, .. } = refinement.config;
         if refinement.done >= steps || self.cloud.is_empty() || self.keyframes.is_empty() || stop() {
             return Ok(None);
@@ -69,7 +73,7 @@ impl Mapper {
             let coarse = refinement.progress() < half_size_share;
             let keyframes: Vec<usize> =
                 (refinement.done..end.min(refinement.done + BATCH)).map(|_| self.draw_from(refinement)).collect();
-            let batch: Vec<Step> = keyframes.into_iter().map(|keyframe| Step { keyframe, coarse, pace: 1.0 }).collect();
+            let batch: Vec<Step> = keyframes.into_iter().map(|keyframe| Step { keyframe, coarse, lr_scale: 1.0 }).collect();
             self.config.adam = refinement.rates();
             for report in self.steps(&batch, None)? {
                 psnr = (psnr.0 + report.loss.psnr_db(), psnr.1 + 1);
@@ -81,7 +85,7 @@ impl Mapper {
         Ok(Some(RefineReport { steps_done: refinement.done, pruned, grown, gaussians: self.cloud.len(), psnr_db }))
     }
 
-    fn draw_from(&mut self, refinement: &mut Refinement) -> usize {
+    fn draw_from(&mut self, refinement: &mut FinalRefinement) -> usize {
         if refinement.epoch.is_empty() {
             refinement.epoch = (0..self.keyframes.len()).filter(|&k| self.keyframes[k].has_image()).collect();
             self.rng.shuffle(&mut refinement.epoch);
@@ -90,13 +94,13 @@ impl Mapper {
     }
 
     /// Density control by views spread over all keyframes, others in each round.
-    fn score_and_control(&mut self, refinement: &mut Refinement) -> Result<(usize, usize), MappingError> {
+    fn score_and_control(&mut self, refinement: &mut FinalRefinement) -> Result<(usize, usize), MappingError> {
         let mut views: Vec<usize> = (0..self.keyframes.len()).filter(|&k| self.keyframes[k].has_image()).collect();
         let count = views.len();
         views.rotate_left(refinement.rounds % count);
         refinement.rounds += 1;
         refinement.done += self.score(&views)?;
-        self.ledger.keyframe_mapped();
+        self.stats.keyframe_mapped();
         self.control_density()
     }
 }

@@ -6,35 +6,33 @@ use std::time::Duration;
 use fastrand::Rng;
 use serde::{Deserialize, Serialize};
 
-use super::{Mapper, MappingError, Refinement};
+use super::{FinalRefinement, Mapper, MappingError};
 use crate::gpu::Gpu;
+use crate::mapping::gaussian_stats::GaussianStats;
 use crate::mapping::keyframe::{KeyframeState, MappedKeyframe};
-use crate::mapping::ledger::Ledger;
 use crate::mapping::{Keyframe, MappingConfig};
-use crate::optimise::OptimiserState;
-use crate::render::{CloudState, GpuCloud, Room};
+use crate::optimise::TrainerState;
+use crate::render::{CloudState, GpuCloud};
 
 /// Between two keyframes, or between two rounds of a refinement.
 #[derive(Debug, Serialize, Deserialize)]
 pub struct MapperState {
     cloud: CloudState,
-    room: Room,
-    optimiser: OptimiserState,
-    ledger: Ledger,
+    trainer: TrainerState,
+    stats: GaussianStats,
     keyframes: Vec<KeyframeState>,
     rng: u64,
     step_times: Vec<Duration>,
-    refinement: Option<Refinement>,
+    refinement: Option<FinalRefinement>,
 }
 
 impl Mapper {
     /// The state, and where the refinement stands if it has begun.
-    pub fn state(&self, refinement: Option<&Refinement>) -> Result<MapperState, MappingError> {
+    pub fn state(&self, refinement: Option<&FinalRefinement>) -> Result<MapperState, MappingError> {
         Ok(MapperState {
             cloud: self.cloud.state(&self.gpu)?,
-            room: self.rasterizer.room(),
-            optimiser: self.optimiser.state(),
-            ledger: self.ledger.clone(),
+            trainer: self.trainer.state(),
+            stats: self.stats.clone(),
             keyframes: self.keyframes.iter().map(|keyframe| keyframe.state(&self.gpu)).collect::<Result<_, _>>()?,
             rng: self.rng.get_seed(),
             step_times: self.step_times.clone(),
@@ -46,12 +44,11 @@ impl Mapper {
     pub fn restore(gpu: Arc<Gpu>, config: &MappingConfig, state: &MapperState) -> Result<Self, MappingError> {
         let mut mapper = Self::new(gpu, config)?;
         mapper.cloud = GpuCloud::restore(&mapper.gpu, config.sh_degree, &state.cloud)?.ok_or(MappingError::State)?;
-        if state.ledger.entries().len() != mapper.cloud.len() {
+        if state.stats.histories().len() != mapper.cloud.len() {
             return Err(MappingError::State);
         }
-        mapper.rasterizer.make(state.room)?;
-        mapper.optimiser.restore(&mapper.gpu, &state.optimiser)?;
-        mapper.ledger = state.ledger.clone();
+        mapper.trainer.restore(&state.trainer)?;
+        mapper.stats = state.stats.clone();
         mapper.rng = Rng::with_seed(state.rng);
         mapper.step_times = state.step_times.clone();
         Ok(mapper)
@@ -75,7 +72,7 @@ impl Mapper {
 
 impl MapperState {
     /// Where the refinement stands, if it has begun.
-    pub fn into_refinement(self) -> Option<Refinement> {
+    pub fn into_refinement(self) -> Option<FinalRefinement> {
         self.refinement
     }
 }

@@ -88,9 +88,9 @@ struct Run {
 fn run(machine: &Machine, scene: &Scene, target: &TargetImage, loss: &LossConfig) -> Result<Run, GpuError> {
     let on_gpu = machine.upload(&scene.cloud)?;
     let view = TrainingView::new(scene.camera, target);
-    machine.with(1, |rasterizer, optimiser| {
-        let gradient = optimiser.gradients(rasterizer, &on_gpu, &scene.camera, target, loss)?.cloud;
-        let reports = optimiser.steps(rasterizer, &on_gpu, &[view; STEPS], (loss, &AdamConfig::default()))?;
+    machine.with(1, |trainer| {
+        let gradient = trainer.gradients(&on_gpu, &scene.camera, target, loss)?.cloud;
+        let reports = trainer.steps(&on_gpu, &[view; STEPS], loss, &AdamConfig::default())?;
         let losses = reports.iter().map(|r| f64::from(r.loss.total(loss))).collect();
         Ok(Run { map: on_gpu.download(&machine.gpu)?, losses, gradient: cloud64(&gradient) })
     })
@@ -108,7 +108,7 @@ fn scene(rng: &mut Rng) -> Scene {
 fn targets(machine: &Machine, rng: &mut Rng, scene: &Scene, scale: f64) -> Result<[TargetImage; 2], GpuError> {
     let other = Scene { camera: scene.camera, ..Scene::random(rng, Fault::None) };
     let on_gpu = machine.upload(&other.cloud)?;
-    let mut rendered = machine.with(1, |rasterizer, _| rasterizer.render(&on_gpu, &scene.camera, [0.0; 3]))?;
+    let mut rendered = machine.with(1, |trainer| trainer.render(&on_gpu, &scene.camera, [0.0; 3]))?;
     let at_home = target(machine, &rendered)?;
     rendered.color_depth.iter_mut().for_each(|v| v[3] *= scale as f32);
     Ok([at_home, target(machine, &rendered)?])

@@ -53,8 +53,8 @@ fn long(machine: &Machine, rng: &mut Rng, steps: usize) -> Result<Outcome, GpuEr
     let cameras = (0..VIEWS).map(|k| ViewCamera { camera_from_world: aside(k) * camera.camera_from_world, ..camera });
     let cameras: Vec<ViewCamera> = cameras.collect();
     let on_gpu = machine.upload(&truth)?;
-    let targets = machine.with(1, |rasterizer, _| {
-        let render = |camera| target(machine, &rasterizer.render(&on_gpu, camera, [0.0; 3])?);
+    let targets = machine.with(1, |trainer| {
+        let render = |camera| target(machine, &trainer.render(&on_gpu, camera, [0.0; 3])?);
         cameras.iter().map(render).collect::<Result<Vec<_>, GpuError>>()
     })?;
     let mut start = truth.clone();
@@ -69,9 +69,9 @@ fn long(machine: &Machine, rng: &mut Rng, steps: usize) -> Result<Outcome, GpuEr
     let batch: Vec<TrainingView<'_>> = (0..BATCH).map(view).collect();
     let (loss, adam) = (LossConfig::default(), AdamConfig::default());
     let mut losses = Vec::new();
-    machine.with(1, |rasterizer, optimiser| {
+    machine.with(1, |trainer| {
         for _ in 0..steps.div_ceil(BATCH) {
-            let reports = optimiser.steps(rasterizer, &on_gpu, &batch, (&loss, &adam))?;
+            let reports = trainer.steps(&on_gpu, &batch, &loss, &adam)?;
             losses.push(reports.iter().map(|r| f64::from(r.loss.total(&loss))).sum::<f64>() / BATCH as f64);
         }
         Ok::<_, GpuError>(())

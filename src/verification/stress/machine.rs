@@ -4,15 +4,15 @@ use std::cell::RefCell;
 use std::sync::Arc;
 
 use crate::gpu::{Gpu, GpuError};
-use crate::optimise::Optimiser;
-use crate::render::{BlendForm, GpuCloud, Rasterizer};
+use crate::optimise::Trainer;
+use crate::render::{BlendForm, GpuCloud};
 use crate::splat::GaussianCloud;
 
-/// A rasterizer of each form of the blending passes, with its optimiser.
+/// A trainer of each form of the blending passes.
 #[derive(Debug)]
 pub struct Machine {
     pub gpu: Arc<Gpu>,
-    forms: [RefCell<(Rasterizer, Optimiser)>; 2],
+    forms: [RefCell<Trainer>; 2],
 }
 
 impl Machine {
@@ -22,19 +22,14 @@ impl Machine {
     /// [`GpuError`] if there is none.
     pub fn open(adapter: Option<&str>) -> Result<Self, GpuError> {
         let gpu = Gpu::open(adapter)?;
-        let form = |form| -> Result<_, GpuError> {
-            let rasterizer = Rasterizer::with_form(gpu.clone(), form)?;
-            let optimiser = Optimiser::new(&rasterizer)?;
-            Ok(RefCell::new((rasterizer, optimiser)))
-        };
+        let form = |form| -> Result<_, GpuError> { Ok(RefCell::new(Trainer::with_form(gpu.clone(), form)?)) };
         let [first, second] = BlendForm::ALL;
         Ok(Self { forms: [form(first)?, form(second)?], gpu })
     }
 
     /// Runs on one of the two forms.
-    pub(super) fn with<T>(&self, form: usize, work: impl FnOnce(&mut Rasterizer, &mut Optimiser) -> T) -> T {
-        let (rasterizer, optimiser) = &mut *self.forms[form % 2].borrow_mut();
-        work(rasterizer, optimiser)
+    pub(super) fn with<T>(&self, form: usize, work: impl FnOnce(&mut Trainer) -> T) -> T {
+        work(&mut self.forms[form % 2].borrow_mut())
     }
 
     pub(super) fn upload(&self, cloud: &GaussianCloud) -> Result<GpuCloud, GpuError> {

@@ -11,6 +11,7 @@ use super::scenes::{Fault, Scene, between, narrow};
 use super::{Family, Machine, Outcome, Part};
 use crate::geometry::Se3;
 use crate::gpu::GpuError;
+use crate::optimise::ImageGradients;
 use crate::render::Rendered;
 use crate::splat::GaussianCloud;
 use crate::verification::reference::project_backward::backward;
@@ -118,12 +119,12 @@ fn compare(
     let on_gpu = machine.upload(&scene.cloud)?;
     let by_image = image_gradient(rng, trusted);
     let colors = by_image.color.iter().zip(&by_image.depth);
-    let by_color: Vec<[f32; 4]> = colors.map(|(c, d)| [c.x as f32, c.y as f32, c.z as f32, *d as f32]).collect();
-    let by_alpha: Vec<f32> = by_image.alpha.iter().map(|a| *a as f32).collect();
-    let (rendered, gradients) = machine.with(rng.usize(..2), |rasterizer, optimiser| {
-        let rendered = rasterizer.render(&on_gpu, &scene.camera, BACKGROUND)?;
-        let by = (by_color.as_slice(), by_alpha.as_slice());
-        Ok::<_, GpuError>((rendered, optimiser.gradients_from_image(rasterizer, &on_gpu, &scene.camera, BACKGROUND, by)?))
+    let color_depth = colors.map(|(c, d)| [c.x as f32, c.y as f32, c.z as f32, *d as f32]).collect();
+    let alpha = by_image.alpha.iter().map(|a| *a as f32).collect();
+    let by = ImageGradients { color_depth, alpha };
+    let (rendered, gradients) = machine.with(rng.usize(..2), |trainer| {
+        let rendered = trainer.render(&on_gpu, &scene.camera, BACKGROUND)?;
+        Ok::<_, GpuError>((rendered, trainer.gradients_from_image(&on_gpu, &scene.camera, BACKGROUND, &by)?))
     })?;
     compare_images(&mut outcome, &rendered, &rasterize_forward::render(view, wide), trusted, image_limit);
     let expected = backward(view, wide, &by_image);
@@ -144,7 +145,7 @@ fn shifted(machine: &Machine, rng: &mut Rng, metres: f64) -> Result<Outcome, Gpu
     let limits = [f64::INFINITY, f64::INFINITY];
     let mut outcome = compare(machine, rng, &there, (&view, &wide, &vec![true; pixels]), limits)?;
     let on_gpu = machine.upload(&there.cloud)?;
-    let rendered = machine.with(0, |rasterizer, _| rasterizer.render(&on_gpu, &there.camera, BACKGROUND))?;
+    let rendered = machine.with(0, |trainer| trainer.render(&on_gpu, &there.camera, BACKGROUND))?;
     outcome.note("colours against home, RMS", rms(&rendered, &rasterize_forward::render(&view, &wide)));
     // What the positions alone lose by being written in f32 there: the same, rendered by the oracle.
     let back = away.inverse();

@@ -7,7 +7,7 @@ use image::{Rgb, RgbImage};
 use super::scenes::{Fault, Scene, between};
 use super::{Family, Machine, Outcome, Part};
 use crate::gpu::GpuError;
-use crate::optimise::{AdamConfig, LossConfig, TargetImage, TileSkip, TrainingView};
+use crate::optimise::{AdamConfig, LossConfig, TargetImage, TileSampling, TrainingView};
 use crate::splat::{Gaussian, GaussianCloud};
 
 const STEPS: usize = 200;
@@ -50,23 +50,23 @@ fn train(machine: &Machine, rng: &mut Rng, scene: &Scene, fault: Fault) -> Resul
     let target = target(machine, rng, size)?;
     let (loss, adam) = (LossConfig::default(), AdamConfig::default());
     let on_gpu = machine.upload(&scene.cloud)?;
-    let skip = rng.bool().then_some(TileSkip { share: 0.5, least: 0.1, noise: 0.0 });
-    let view = TrainingView { skip, ..TrainingView::new(scene.camera, &target) };
-    let whole = TrainingView { skip: None, ..view };
-    machine.with(rng.usize(..2), |rasterizer, optimiser| {
+    let skip = rng.bool().then_some(TileSampling { share: 0.5, min_share: 0.1, noise: 0.0 });
+    let view = TrainingView { tile_sampling: skip, ..TrainingView::new(scene.camera, &target) };
+    let whole = TrainingView { tile_sampling: None, ..view };
+    machine.with(rng.usize(..2), |trainer| {
         let mut outcome = Outcome::default();
         let mut losses = Vec::new();
         let mut before_last = on_gpu.download(&machine.gpu)?;
-        let at_first_by = optimiser.gradients(rasterizer, &on_gpu, &scene.camera, &target, &loss)?.cloud;
+        let at_first_by = trainer.gradients(&on_gpu, &scene.camera, &target, &loss)?.cloud;
         let mut before_last_by = at_first_by.clone();
         for done in (0..STEPS).step_by(LAST_STEPS) {
             let is_last = done + LAST_STEPS >= STEPS;
             if is_last {
                 before_last = on_gpu.download(&machine.gpu)?;
-                before_last_by = optimiser.gradients(rasterizer, &on_gpu, &scene.camera, &target, &loss)?.cloud;
+                before_last_by = trainer.gradients(&on_gpu, &scene.camera, &target, &loss)?.cloud;
             }
             let views = if is_last { [whole; LAST_STEPS] } else { [view; LAST_STEPS] };
-            let reports = optimiser.steps(rasterizer, &on_gpu, &views, (&loss, &adam))?;
+            let reports = trainer.steps(&on_gpu, &views, &loss, &adam)?;
             losses.extend(reports.iter().map(|r| r.loss.total(&loss)));
             let finite = reports.iter().all(|r| r.pose.iter().all(|v| v.is_finite()));
             outcome.require(finite, || format!("a pose gradient is not finite by step {}", done + LAST_STEPS));
@@ -75,7 +75,7 @@ fn train(machine: &Machine, rng: &mut Rng, scene: &Scene, fault: Fault) -> Resul
         // Where little or nothing is seen there is nothing to gain; noise cannot be fitted by single pixels' Gaussians.
         let limit = if fault == Fault::None { 1.0 } else { 1.05 };
         outcome.measure("loss after, of before", f64::from(losses[STEPS - 1] / losses[0].max(1e-6)), limit);
-        let gradients = optimiser.gradients(rasterizer, &on_gpu, &scene.camera, &target, &loss)?.cloud;
+        let gradients = trainer.gradients(&on_gpu, &scene.camera, &target, &loss)?.cloud;
         let after = on_gpu.download(&machine.gpu)?;
         outcome.count("Gaussians", after.len());
         outcome.count("never seen", (0..after.len()).filter(|i| !is_seen(&at_first_by, *i)).count());
@@ -126,7 +126,7 @@ fn check_parameters(outcome: &mut Outcome, before: &GaussianCloud, after: &Gauss
         opacity = opacity.max((new.raw_opacity - old.raw_opacity).abs());
         needles += usize::from(new != old && elongation(new.log_scale) > adam.max_elongation.ln() + 1e-3);
     }
-    outcome.measure("growth of a log scale", growth.into(), (reach * adam.scale_rate).into());
-    outcome.measure("change of a raw opacity", opacity.into(), (reach * adam.opacity_rate).into());
+    outcome.measure("growth of a log scale", growth.into(), (reach * adam.lr_log_scale).into());
+    outcome.measure("change of a raw opacity", opacity.into(), (reach * adam.lr_opacity).into());
     outcome.require(needles == 0, || format!("{needles} Gaussians that moved are needles"));
 }

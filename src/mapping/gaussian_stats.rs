@@ -1,4 +1,4 @@
-//! What the mapper remembers of each Gaussian: the keyframe that it was seeded from (when a closed loop moves a keyframe, its Gaussians
+//! What the mapper remembers of each Gaussian: the keyframe that it was inserted from (when a closed loop moves a keyframe, its Gaussians
 //! go with it), its age, and what it was ever worth.
 
 use std::collections::BTreeMap;
@@ -16,7 +16,7 @@ const MIN_TURN_RAD: f64 = 0.5 * std::f64::consts::PI / 180.0;
 
 /// Of one Gaussian.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub(super) struct Entry {
+pub(super) struct GaussianHistory {
     /// It moves with this keyframe.
     pub anchor: KeyframeId,
     /// Keyframes, or rounds of a refinement, since it came.
@@ -26,51 +26,52 @@ pub(super) struct Entry {
     /// The most that it added to a pixel of these, 0 to 1.
     pub best_weight: f32,
     /// The most that it added to one view, pixels.
-    pub worth: f32,
+    pub contribution: f32,
 }
 
-/// The entries, `[N]` in map order. Seeds are appended and pruning keeps the order, so most of a keyframe's Gaussians lie side by side.
+/// The histories, `[N]` in map order. Seeds are appended and pruning keeps the order, so most of a keyframe's Gaussians lie side by side.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
-pub(super) struct Ledger {
-    entries: Vec<Entry>,
+pub(super) struct GaussianStats {
+    histories: Vec<GaussianHistory>,
 }
 
-impl Ledger {
+impl GaussianStats {
     /// The newest `count` Gaussians are of `keyframe`.
     pub fn append(&mut self, keyframe: KeyframeId, count: usize) {
-        self.entries.extend(std::iter::repeat_n(Entry { anchor: keyframe, ..Entry::default() }, count));
+        self.histories.extend(std::iter::repeat_n(GaussianHistory { anchor: keyframe, ..GaussianHistory::default() }, count));
     }
 
     /// Only the Gaussians at `keep` are left, and those of `parents` each have a child at the end.
     pub fn apply(&mut self, keep: &[u32], parents: impl Iterator<Item = u32>) {
-        let child = |parent: u32| Entry { anchor: self.entries[parent as usize].anchor, ..Entry::default() };
-        let kept = keep.iter().map(|i| self.entries[*i as usize]);
-        self.entries = kept.chain(parents.map(child)).collect();
+        let child =
+            |parent: u32| GaussianHistory { anchor: self.histories[parent as usize].anchor, ..GaussianHistory::default() };
+        let kept = keep.iter().map(|i| self.histories[*i as usize]);
+        self.histories = kept.chain(parents.map(child)).collect();
     }
 
     /// Another keyframe was mapped.
     pub fn keyframe_mapped(&mut self) {
-        self.entries.iter_mut().for_each(|entry| entry.age += 1);
+        self.histories.iter_mut().for_each(|history| history.age += 1);
     }
 
     /// Views were scored.
     pub fn scored(&mut self, scores: &[GaussianScore]) {
-        for (entry, score) in self.entries.iter_mut().zip(scores) {
-            entry.views += score.views as u32;
-            entry.best_weight = entry.best_weight.max(score.weight_max);
-            entry.worth = entry.worth.max(score.weight_sum / score.views.max(1.0));
+        for (history, score) in self.histories.iter_mut().zip(scores) {
+            history.views += score.views as u32;
+            history.best_weight = history.best_weight.max(score.weight_max);
+            history.contribution = history.contribution.max(score.weight_sum / score.views.max(1.0));
         }
     }
 
-    pub fn entries(&self) -> &[Entry] {
-        &self.entries
+    pub fn histories(&self) -> &[GaussianHistory] {
+        &self.histories
     }
 
     /// The runs of Gaussians whose keyframe is among `motions`, and each run's motion.
     pub fn moved(&self, motions: &BTreeMap<KeyframeId, Se3>) -> Vec<(Range<usize>, Se3)> {
         let mut runs = Vec::new();
         let mut first = 0;
-        for run in self.entries.chunk_by(|a, b| a.anchor == b.anchor) {
+        for run in self.histories.chunk_by(|a, b| a.anchor == b.anchor) {
             if let Some(motion) = motions.get(&run[0].anchor) {
                 runs.push((first..first + run.len(), *motion));
             }
@@ -94,13 +95,13 @@ mod tests {
 
     #[test]
     fn runs_follow_appending_pruning_and_growing() {
-        let mut ledger = Ledger::default();
-        [(0, 4), (2, 3), (5, 2)].into_iter().for_each(|(keyframe, count)| ledger.append(keyframe, count));
-        ledger.apply(&[0, 3, 4, 6, 8], [1, 5, 5].into_iter());
+        let mut stats = GaussianStats::default();
+        [(0, 4), (2, 3), (5, 2)].into_iter().for_each(|(keyframe, count)| stats.append(keyframe, count));
+        stats.apply(&[0, 3, 4, 6, 8], [1, 5, 5].into_iter());
         let shift = Se3::translation(1.0, 0.0, 0.0);
         let motions = BTreeMap::from([(2, shift), (5, shift), (7, shift)]);
-        assert_eq!(ledger.moved(&motions), [(2..4, shift), (4..5, shift), (6..8, shift)]);
-        assert!(ledger.moved(&BTreeMap::new()).is_empty());
+        assert_eq!(stats.moved(&motions), [(2..4, shift), (4..5, shift), (6..8, shift)]);
+        assert!(stats.moved(&BTreeMap::new()).is_empty());
     }
 
     #[test]

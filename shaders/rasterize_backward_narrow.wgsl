@@ -1,11 +1,11 @@
-// Gradient of the blended image with respect to each (Gaussian, tile) pair, written to the pair's own slot: no atomics, and the sum
+// Gradient of the blended image with respect to each (Gaussian, tile) intersection, written to the intersection's own slot: no atomics, and the sum
 // over a Gaussian's slots runs in a fixed order.
 //
 // This form keeps blocks of pixels in each invocation while the Gaussians pass, and sums over the tile's invocations. It suits narrow SIMD units
-// (the software adapter); `rasterize_backward_splats` suits wide ones.
+// (the software adapter); `rasterize_backward_wide` suits wide ones.
 
 const CHUNK: u32 = 8u;
-// [GROUP_TILES, CHUNK, 3, TILE_THREADS] what each invocation adds to each pair of the chunk.
+// [GROUP_TILES, CHUNK, 3, TILE_THREADS] what each invocation adds to each intersection of the chunk.
 var<workgroup> partial: array<vec4<f32>, CHUNK * 3u * THREADS>;
 
 @compute @workgroup_size(THREADS)
@@ -34,10 +34,10 @@ fn main(
             for (var k = chunk; k < chunk_end; k++) {
                 let at = place.member * BATCH + k - start;
                 let mean = batch_mean[at];
-                let shape = batch_whitening[at];
+                let shape = batch_conic_factor[at];
                 let color = batch_color[at];
                 let dx = block.x - mean.x;
-                var sum = PairGradient(vec4(0.0), vec4(0.0), vec4(0.0));
+                var sum = IntersectionGradient(vec4(0.0), vec4(0.0), vec4(0.0));
                 for (var s = 0u; s < STRIPS; s++) {
                     var strip = pixels[s];
                     add_gradient(dx, block.y + f32(s) - mean.y, mean, shape, color, k, &strip, &sum);
@@ -55,7 +55,7 @@ fn main(
                     sum += partial[partials + item * TILE_THREADS + i];
                 }
                 let slot = sorted_slots[place.range.x + chunk + item / 3u];
-                pair_gradients[slot * 3u + item % 3u] = sum;
+                intersection_gradients[slot * 3u + item % 3u] = sum;
             }
             workgroupBarrier();
         }

@@ -1,4 +1,4 @@
-// The same gradients as `rasterize_backward_pixels`, in the form that suits wide SIMD units (after Mallick et al. 2024, Taming 3DGS,
+// The same gradients as `rasterize_backward_narrow`, in the form that suits wide SIMD units (after Mallick et al. 2024, Taming 3DGS,
 // but without their per-bucket checkpoints): each invocation keeps a Gaussian and its sums in registers, and the tile's strips of pixels
 // pass by. At each step invocation i works on the strip that invocation i - 1 has just left, so that every strip meets the Gaussians
 // in their order; an invocation that has seen all strips takes the Gaussian TILE_THREADS places further on, and no lane ever idles but
@@ -22,7 +22,7 @@ fn main(
     var mean = vec4(0.0);
     var shape = vec4(0.0);
     var color = vec4(0.0);
-    var sum = PairGradient(vec4(0.0), vec4(0.0), vec4(0.0));
+    var sum = IntersectionGradient(vec4(0.0), vec4(0.0), vec4(0.0));
     for (var step = 0u; step < end; step++) {
         if step % TILE_THREADS == 0u && step < count {
             load_batch(place, step, min(step + TILE_THREADS, count));
@@ -35,9 +35,9 @@ fn main(
         if step >= local && position < count {
             if turn == 0u {
                 mean = batch_mean[local];
-                shape = batch_whitening[local];
+                shape = batch_conic_factor[local];
                 color = batch_color[local];
-                sum = PairGradient(vec4(0.0), vec4(0.0), vec4(0.0));
+                sum = IntersectionGradient(vec4(0.0), vec4(0.0), vec4(0.0));
             }
             let block = block_of(place.tile, turn);
             var pixels = strips[turn];
@@ -46,9 +46,9 @@ fn main(
             strips[turn].behind = pixels.behind;
             if turn == TILE_THREADS - 1u {
                 let slot = sorted_slots[place.range.x + position];
-                pair_gradients[slot * 3u] = before_clamp(color, sum.color_depth);
-                pair_gradients[slot * 3u + 1u] = sum.first;
-                pair_gradients[slot * 3u + 2u] = sum.second;
+                intersection_gradients[slot * 3u] = before_clamp(color, sum.color_depth);
+                intersection_gradients[slot * 3u + 1u] = sum.first;
+                intersection_gradients[slot * 3u + 2u] = sum.second;
             }
         }
         workgroupBarrier();

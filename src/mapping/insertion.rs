@@ -1,14 +1,14 @@
 //! New Gaussians from a keyframe: where the render lacks alpha, lies behind the measured surface or misses detail, one per block of pixels:
-//! a quadtree of blocks, small where the colours vary and large where they don't, each seed the size of its block on the surface.
+//! a quadtree of blocks, small where the colours vary and large where they don't, each Gaussian the size of its block on the surface.
 //!
-//! Pixels without depth are seeded too where the map has nothing: their depth is interpolated across the hole, from the farther side
+//! Pixels without depth get Gaussians too where the map has nothing: their depth is interpolated across the hole, from the farther side
 //! where the sides differ (a structured-light sensor is blind in the shadow beside a near object). Later views correct them.
 
 use glam::{Quat, Vec3};
 use image::RgbImage;
 use nalgebra::{Point3, Rotation3, UnitQuaternion, Vector2, Vector3};
 
-use super::{Keyframe, SeedingConfig};
+use super::{InsertionConfig, Keyframe};
 use crate::render::Rendered;
 use crate::sequence::DepthImage;
 use crate::splat::{Gaussian, GaussianCloud, ShDegree, raw_opacity_from_opacity, sh::dc_from_color};
@@ -19,11 +19,11 @@ const SAME_SURFACE_RATIO: f32 = 1.2;
 /// Discs seen more obliquely than this are drawn no longer.
 const MIN_COSINE: f64 = 0.35;
 
-/// Seeds for what `keyframe` shows and `rendered`, the map seen from it, does not. Without a render the whole image is seeded.
-pub(super) fn seed(
+/// Gaussians for what `keyframe` shows and `rendered`, the map seen from it, lacks. Without a render they cover the whole image.
+pub(super) fn gaussians(
     keyframe: &Keyframe,
     rendered: Option<&Rendered>,
-    config: &SeedingConfig,
+    config: &InsertionConfig,
     sh_degree: ShDegree,
 ) -> GaussianCloud {
     let mut cloud = GaussianCloud::new(sh_degree);
@@ -50,7 +50,7 @@ pub(super) fn seed(
 }
 
 /// Whether the map lacks what the pixel shows.
-fn lacks(rendered: &Rendered, pixel: usize, measured: Option<f32>, config: &SeedingConfig) -> bool {
+fn lacks(rendered: &Rendered, pixel: usize, measured: Option<f32>, config: &InsertionConfig) -> bool {
     let nearer = |m: f32| rendered.expected_depth(pixel) - m > config.depth_disagreement * m;
     rendered.alpha(pixel) < config.min_alpha || measured.is_some_and(nearer)
 }
@@ -74,7 +74,7 @@ fn gaussian(
     (x, y): (u32, u32),
     (metres, slope): (f32, [f32; 2]),
     stride: u32,
-    config: &SeedingConfig,
+    config: &InsertionConfig,
 ) -> Gaussian {
     let pinhole = &keyframe.image.pinhole;
     let ray = pinhole.unproject(&Vector2::new(f64::from(x), f64::from(y)), 1.0);
@@ -107,7 +107,7 @@ fn gaussian(
     }
 }
 
-/// A square of pixels that gets one seed.
+/// A square of pixels that gets one Gaussian.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Block {
     x: u32,
@@ -157,7 +157,7 @@ impl ColorSums {
     }
 
     /// Blocks that cover the image: quartered while their colours deviate more than noise does, but not below the stride.
-    fn blocks(&self, config: &SeedingConfig) -> Vec<Block> {
+    fn blocks(&self, config: &InsertionConfig) -> Vec<Block> {
         let size = config.flat_stride;
         let corners =
             (0..self.0.height).step_by(size as usize).flat_map(|y| (0..self.0.width).step_by(size as usize).map(move |x| (x, y)));
@@ -255,10 +255,10 @@ mod tests {
     }
 
     #[test]
-    fn detail_gets_more_seeds_than_a_flat_wall() {
-        let config = SeedingConfig { stride: 2, flat_stride: 8, ..SeedingConfig::default() };
+    fn detail_gets_more_gaussians_than_a_flat_wall() {
+        let config = InsertionConfig { stride: 2, flat_stride: 8, ..InsertionConfig::default() };
         let checker = RgbImage::from_fn(32, 24, |x, y| if x < 16 { Rgb([90; 3]) } else { Rgb([((x + y) % 2 * 255) as u8; 3]) });
-        let cloud = seed(&keyframe(checker, vec![1.0; 32 * 24]), None, &config, ShDegree::default());
+        let cloud = gaussians(&keyframe(checker, vec![1.0; 32 * 24]), None, &config, ShDegree::default());
         let column = |m: &Vec3| m.x * 30.0 + 15.5;
         assert_eq!(cloud.means.iter().filter(|m| column(m) < 15.9).count(), 2 * 3);
         assert_eq!(cloud.means.iter().filter(|m| column(m) > 16.1).count(), 8 * 12);
@@ -266,7 +266,7 @@ mod tests {
 
     #[test]
     fn blocks_cover_each_pixel_once_and_shrink_towards_an_edge() {
-        let config = SeedingConfig { stride: 1, flat_stride: 8, ..SeedingConfig::default() };
+        let config = InsertionConfig { stride: 1, flat_stride: 8, ..InsertionConfig::default() };
         let edge = RgbImage::from_fn(45, 27, |x, y| if x < 19 { Rgb([40; 3]) } else { Rgb([200 + (y % 2) as u8; 3]) });
         let blocks = ColorSums::new(&edge).blocks(&config);
         let mut covered = vec![0; 45 * 27];
@@ -283,8 +283,8 @@ mod tests {
     }
 
     #[test]
-    fn only_what_the_map_lacks_is_seeded() {
-        let config = SeedingConfig { flat_stride: 2, ..SeedingConfig::default() };
+    fn only_what_the_map_lacks_is_inserted() {
+        let config = InsertionConfig { flat_stride: 2, ..InsertionConfig::default() };
         let frame = keyframe(RgbImage::from_pixel(32, 24, Rgb([90; 3])), vec![1.0; 32 * 24]);
         let render = |x: usize| match x / 8 {
             0 => ([0.0, 0.0, 0.0, 1.0], 0.0), // as measured
@@ -299,7 +299,7 @@ mod tests {
             color_depth: pixels.iter().map(|p| p.0).collect(),
             transmittance: pixels.iter().map(|p| p.1).collect(),
         };
-        let cloud = seed(&frame, Some(&rendered), &config, ShDegree::default());
+        let cloud = gaussians(&frame, Some(&rendered), &config, ShDegree::default());
         assert_eq!(cloud.len(), 2 * 4 * 12);
         assert!(cloud.means.iter().all(|m| (7.0..=24.5).contains(&(m.x * 30.0 + 15.5))));
     }
@@ -319,8 +319,8 @@ mod tests {
         assert!(response(8, 12) > 0.3, "{}", response(8, 12));
         assert!([(0, 0), (20, 12), (30, 22)].into_iter().all(|(x, y)| response(x, y) < 1e-3));
         let frame = keyframe(image, vec![1.0; 32 * 24]);
-        let config = SeedingConfig { missed_detail: 0.1, ..SeedingConfig::default() };
-        let cloud = seed(&frame, Some(&rendered), &config, ShDegree::default());
+        let config = InsertionConfig { missed_detail: 0.1, ..InsertionConfig::default() };
+        let cloud = gaussians(&frame, Some(&rendered), &config, ShDegree::default());
         let columns: Vec<f32> = cloud.means.iter().map(|m| m.x * 30.0 + 15.5).collect();
         assert!(!columns.is_empty() && columns.iter().all(|c| (6.0..13.0).contains(c)), "{columns:?}");
     }

@@ -1,34 +1,44 @@
-//! What an optimiser remembers from one step to the next, apart from the map and its targets: a count, and how large its buffers are.
-//! The latter decides nothing by itself, but where memory is limited all that is in use counts.
+//! State of a trainer between two steps, apart from the map and its targets: the number of steps and the capacities of its buffers.
+//! The capacity for intersections decides which steps overflow and are repeated; the others count where memory is limited.
 
 use serde::{Deserialize, Serialize};
 
-use super::Optimiser;
+use super::Trainer;
 use crate::gpu::{Gpu, GpuBuffer, GpuError};
 use crate::optimise::image_buffers;
+use crate::render::Capacities;
 
+/// Number of steps and buffer capacities of a [`Trainer`].
 #[derive(Clone, Debug, Serialize, Deserialize)]
-pub struct OptimiserState {
+pub struct TrainerState {
     /// Steps submitted so far: seeds the draws of tiles, and says when harmonics move.
     steps: usize,
     /// Width and height of the views that there are buffers for, the latest first.
     sizes: Vec<(u32, u32)>,
     gaussians: usize,
     scored: usize,
+    rasterizer: Capacities,
 }
 
-impl Optimiser {
-    pub fn state(&self) -> OptimiserState {
-        OptimiserState {
+impl Trainer {
+    /// The state to restore a trainer from.
+    pub fn state(&self) -> TrainerState {
+        TrainerState {
             steps: self.steps,
             sizes: self.images.iter().map(|images| images.size).collect(),
             gaussians: self.gaussians,
             scored: self.scores.capacity(),
+            rasterizer: self.rasterizer.capacities(),
         }
     }
 
-    /// Becomes, from a new optimiser, the one that a state is of.
-    pub fn restore(&mut self, gpu: &Gpu, state: &OptimiserState) -> Result<(), GpuError> {
+    /// Puts a new trainer into the given state.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit.
+    pub fn restore(&mut self, state: &TrainerState) -> Result<(), GpuError> {
+        let gpu = &self.rasterizer.gpu().clone();
+        self.rasterizer.reserve(state.rasterizer)?;
         self.steps = state.steps;
         for size in state.sizes.iter().rev() {
             image_buffers::choose(&mut self.images, gpu, *size)?;

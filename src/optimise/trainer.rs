@@ -2,20 +2,21 @@
 
 mod state;
 
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-pub use state::OptimiserState;
+pub use state::TrainerState;
 
 use bytemuck::{Pod, Zeroable};
 
 use super::image_buffers::{self, ImageBuffers, LOSS_TILE};
 use super::kernels::Kernels;
 use super::scores::{GaussianScore, Scores, WrongPixels};
-use super::skip::{SkippedTiles, TileSkip};
+use super::tile_sampling::{TileSampler, TileSampling};
 use super::{AdamConfig, LossConfig, LossTerms, TargetImage};
 use crate::gpu::{Gpu, GpuBuffer, GpuError};
 use crate::render::layout::{AdamSetup, COUNTERS, Counter, LossSetup, VISIBLE_COUNTER, View};
-use crate::render::{GpuCloud, PreparedView, Rasterizer, ViewCounts, cloud_from_planes};
+use crate::render::{BlendForm, GpuCloud, PreparedView, Rasterizer, Rendered, ViewCounts, cloud_from_planes};
 use crate::splat::{GaussianCloud, ViewCamera};
 
 /// What a step did.
@@ -32,20 +33,20 @@ pub struct StepReport {
 pub struct TrainingView<'a> {
     pub camera: ViewCamera,
     pub target: &'a TargetImage,
-    /// Whether the step also scores the Gaussians (see [`Optimiser::begin_scores`]).
+    /// Whether the step also scores the Gaussians (see [`Trainer::begin_scores`]).
     pub scored: Option<WrongPixels>,
-    /// Share of Adam's step sizes that the step takes.
-    pub pace: f32,
-    /// Share of its weight in the loss that the target's depth deserves: 1 if a sensor measured it.
-    pub depth_trust: f32,
-    /// Which tiles are left out; a scored step leaves none.
-    pub skip: Option<TileSkip>,
+    /// Factor on all learning rates of the step.
+    pub lr_scale: f32,
+    /// Factor on the weight of the target's depth in the loss: 1 if a sensor measured it.
+    pub depth_confidence: f32,
+    /// Tiles that the step samples; `None`: all. A scored step uses all.
+    pub tile_sampling: Option<TileSampling>,
 }
 
 impl<'a> TrainingView<'a> {
-    /// The whole view at full pace, not scored.
+    /// The whole view at full learning rates, not scored.
     pub fn new(camera: ViewCamera, target: &'a TargetImage) -> Self {
-        Self { camera, target, scored: None, pace: 1.0, depth_trust: 1.0, skip: None }
+        Self { camera, target, scored: None, lr_scale: 1.0, depth_confidence: 1.0, tile_sampling: None }
     }
 }
 
@@ -68,10 +69,24 @@ pub struct Gradients {
     pub pose: [f32; 6],
 }
 
+/// Gradient of a loss by a rendered image.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct ImageGradients {
+    /// `[H, W]` by colour (r, g, b) and by Σ w z, 1/metres.
+    pub color_depth: Vec<[f32; 4]>,
+    /// `[H, W]` by alpha.
+    pub alpha: Vec<f32>,
+}
+
 /// Where the backward pass starts from.
 enum Objective<'a> {
-    /// With the trust in the target's depth, the Gaussians' scores on the way, if asked for, and the tiles to leave out with the draw's seed.
-    Image { target: &'a TargetImage, loss: (&'a LossConfig, f32), scored: Option<&'a WrongPixels>, skip: Option<(TileSkip, u32)> },
+    /// With the confidence in the target's depth, the scores to compute, and the tile sampling with the seed of its draw.
+    Image {
+        target: &'a TargetImage,
+        loss: (&'a LossConfig, f32),
+        scored: Option<&'a WrongPixels>,
+        tile_sampling: Option<(TileSampling, u32)>,
+    },
     /// Gradients by the image are in the buffer already.
     Given,
 }
@@ -82,12 +97,13 @@ enum Sink<'a> {
     Gradient(&'a GpuBuffer),
 }
 
-/// The training step with its scratch buffers.
+/// The training step: the rasterizer, the passes that follow it, and all their scratch buffers.
 #[derive(Debug)]
-pub struct Optimiser {
+pub struct Trainer {
+    rasterizer: Rasterizer,
     kernels: Kernels,
     scores: Scores,
-    skipped: SkippedTiles,
+    sampler: TileSampler,
     /// Steps submitted so far, and the host's time to encode and submit them.
     steps: usize,
     encode_time: Duration,
@@ -101,20 +117,33 @@ pub struct Optimiser {
     pose_gradient: GpuBuffer,
 }
 
-impl Optimiser {
+impl Trainer {
     /// The mark that ends a step's last stage in the profile.
     pub const END_MARK: &'static str = "end";
 
-    /// For the views that `rasterizer` renders: both passes of the blending take the same form.
-    pub fn new(rasterizer: &Rasterizer) -> Result<Self, GpuError> {
+    /// A trainer with the form of the blending passes that suits the adapter.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a shader does not compile or a buffer does not fit.
+    pub fn new(gpu: Arc<Gpu>) -> Result<Self, GpuError> {
+        let form = BlendForm::of(&gpu);
+        Self::with_form(gpu, form)
+    }
+
+    /// A trainer with the given form of the blending passes.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a shader does not compile or a buffer does not fit.
+    pub fn with_form(gpu: Arc<Gpu>, form: BlendForm) -> Result<Self, GpuError> {
+        let rasterizer = Rasterizer::with_form(gpu, form)?;
         let gpu = rasterizer.gpu();
-        let kernels = Kernels::new(rasterizer);
+        let kernels = Kernels::new(&rasterizer);
         gpu.check()?;
         let empty = |label: &str| GpuBuffer::storage(gpu, label, 16);
         Ok(Self {
             kernels,
-            scores: Scores::new(rasterizer)?,
-            skipped: SkippedTiles::new(rasterizer)?,
+            scores: Scores::new(&rasterizer)?,
+            sampler: TileSampler::new(&rasterizer)?,
             steps: 0,
             encode_time: Duration::ZERO,
             adam: GpuBuffer::uniform(gpu, "Adam", &AdamSetup::zeroed())?,
@@ -124,42 +153,43 @@ impl Optimiser {
             loss_total: GpuBuffer::computed_uniform(gpu, "loss", 16)?,
             pose_sums: empty("pose sums")?,
             pose_gradient: GpuBuffer::storage(gpu, "pose gradient", 32)?,
+            rasterizer,
         })
     }
 
     /// For each view in turn: renders the map, compares it with the target, and moves the Gaussians that were blended by one step of
-    /// Adam. The steps are submitted without waiting in between; what they report is read at the end. A step whose pairs did not
+    /// Adam. The steps are submitted without waiting in between; what they report is read at the end. A step whose intersections did not
     /// fit moved nothing and is repeated after the others, with larger buffers.
     pub fn steps(
         &mut self,
-        rasterizer: &mut Rasterizer,
         cloud: &GpuCloud,
         views: &[TrainingView<'_>],
-        (loss, adam): (&LossConfig, &AdamConfig),
+        loss: &LossConfig,
+        adam: &AdamConfig,
     ) -> Result<Vec<StepReport>, GpuError> {
-        let gpu = rasterizer.gpu().clone();
+        let gpu = self.rasterizer.gpu().clone();
         let log = GpuBuffer::storage(&gpu, "step log", (views.len() * std::mem::size_of::<StepLog>()) as u64)?;
         let mut reports = vec![StepReport::default(); views.len()];
         let mut pending: Vec<usize> = (0..views.len()).collect();
         while !pending.is_empty() {
             for (entry, &i) in pending.iter().enumerate() {
-                let TrainingView { camera, target, scored, pace, depth_trust, skip } = &views[i];
-                let skip = skip.filter(|_| scored.is_none()).map(|skip| (skip, self.steps as u32));
-                let objective = Objective::Image { target, loss: (loss, *depth_trust), scored: scored.as_ref(), skip };
+                let TrainingView { camera, target, scored, lr_scale, depth_confidence, tile_sampling } = &views[i];
+                let tile_sampling = tile_sampling.filter(|_| scored.is_none()).map(|sampling| (sampling, self.steps as u32));
+                let objective =
+                    Objective::Image { target, loss: (loss, *depth_confidence), scored: scored.as_ref(), tile_sampling };
                 let started = Instant::now();
-                self.adam.write(&gpu, 0, &[adam.setup(self.steps, *pace)]);
+                self.adam.write(&gpu, 0, &[adam.setup(self.steps, *lr_scale)]);
                 self.steps += 1;
                 let mut encoder = gpu.device.create_command_encoder(&Default::default());
-                self.encode(&mut encoder, rasterizer, cloud, (camera, [0.0; 3]), &objective, &Sink::Adam)?;
-                self.encode_log(&mut encoder, rasterizer, &log, entry);
-                let commands = encoder.finish();
+                self.encode(&mut encoder, cloud, (camera, [0.0; 3]), &objective, &Sink::Adam)?;
+                self.encode_log(&mut encoder, &log, entry);
+                gpu.queue.submit([encoder.finish()]);
                 self.encode_time += started.elapsed();
-                gpu.queue.submit([commands]);
             }
             let entries: Vec<StepLog> = log.read(&gpu, 0, pending.len())?;
             let mut repeat = Vec::new();
             for (&i, entry) in pending.iter().zip(&entries) {
-                match rasterizer.counts(&entry.counters) {
+                match self.rasterizer.counts(&entry.counters) {
                     Some(counts) => {
                         let pixels = views[i].target.width * views[i].target.height;
                         let loss = LossTerms::from_sums(entry.loss, pixels);
@@ -169,21 +199,38 @@ impl Optimiser {
                 }
             }
             for entry in &entries {
-                rasterizer.make_room(&entry.counters)?;
+                self.rasterizer.reserve_for(&entry.counters)?;
             }
             pending = repeat;
         }
         Ok(reports)
     }
 
+    /// Renders a view over `background` and reads it back.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
+    pub fn render(&mut self, cloud: &GpuCloud, camera: &ViewCamera, background: [f32; 3]) -> Result<Rendered, GpuError> {
+        self.rasterizer.render(cloud, camera, background)
+    }
+
+    /// The form of the blending passes.
+    pub fn form(&self) -> BlendForm {
+        self.rasterizer.form()
+    }
+
+    pub(crate) fn rasterizer_mut(&mut self) -> &mut Rasterizer {
+        &mut self.rasterizer
+    }
+
     /// Forgets all scores: from here on, steps of scored views add to those of `cloud`, which must not grow or shrink meanwhile.
-    pub fn begin_scores(&mut self, gpu: &Gpu, cloud: &GpuCloud) -> Result<(), GpuError> {
-        self.scores.clear(gpu, cloud)
+    pub fn begin_scores(&mut self, cloud: &GpuCloud) -> Result<(), GpuError> {
+        self.scores.clear(self.rasterizer.gpu(), cloud)
     }
 
     /// The scores since [`Self::begin_scores`], `[N]` in map order.
-    pub fn read_scores(&self, gpu: &Gpu, cloud: &GpuCloud) -> Result<Vec<GaussianScore>, GpuError> {
-        self.scores.read(gpu, cloud)
+    pub fn read_scores(&self, cloud: &GpuCloud) -> Result<Vec<GaussianScore>, GpuError> {
+        self.scores.read(self.rasterizer.gpu(), cloud)
     }
 
     /// The host's time to encode and submit all steps so far.
@@ -191,9 +238,9 @@ impl Optimiser {
         self.encode_time
     }
 
-    fn encode_log(&self, encoder: &mut wgpu::CommandEncoder, rasterizer: &Rasterizer, log: &GpuBuffer, entry: usize) {
+    fn encode_log(&self, encoder: &mut wgpu::CommandEncoder, log: &GpuBuffer, entry: usize) {
         let to = (entry * std::mem::size_of::<StepLog>()) as u64;
-        let counters = &rasterizer.workspace.counters;
+        let counters = &self.rasterizer.workspace.counters;
         let [pose_at, counters_at] =
             [std::mem::offset_of!(StepLog, pose), std::mem::offset_of!(StepLog, counters)].map(|at| at as u64);
         encoder.copy_buffer_to_buffer(self.loss_total.raw(), 0, log.raw(), to, pose_at);
@@ -204,47 +251,44 @@ impl Optimiser {
     /// The same, but returns the gradients and moves nothing.
     pub fn gradients(
         &mut self,
-        rasterizer: &mut Rasterizer,
         cloud: &GpuCloud,
         camera: &ViewCamera,
         target: &TargetImage,
         loss: &LossConfig,
     ) -> Result<Gradients, GpuError> {
-        let gpu = rasterizer.gpu().clone();
-        let objective = Objective::Image { target, loss: (loss, 1.0), scored: None, skip: None };
-        let mut gradients = self.collect(rasterizer, cloud, camera, [0.0; 3], &objective)?;
+        let gpu = self.rasterizer.gpu().clone();
+        let objective = Objective::Image { target, loss: (loss, 1.0), scored: None, tile_sampling: None };
+        let mut gradients = self.collect(cloud, camera, [0.0; 3], &objective)?;
         gradients.loss = self.read_loss(&gpu, target)?;
         Ok(gradients)
     }
 
-    /// Gradients of any loss, from its gradients by the image: `[H, W]` (r, g, b, Σ w z) and alpha.
+    /// Gradients of any loss by the map and the pose, from its gradients by the image; moves nothing.
     pub fn gradients_from_image(
         &mut self,
-        rasterizer: &mut Rasterizer,
         cloud: &GpuCloud,
         camera: &ViewCamera,
         background: [f32; 3],
-        (by_color_depth, by_alpha): (&[[f32; 4]], &[f32]),
+        by_image: &ImageGradients,
     ) -> Result<Gradients, GpuError> {
-        let gpu = rasterizer.gpu().clone();
+        let gpu = self.rasterizer.gpu().clone();
         self.reserve(&gpu, &View::new(camera, background), cloud)?;
-        self.images[0].gradients.write(&gpu, 0, by_color_depth);
-        let alpha: Vec<[f32; 4]> = by_alpha.iter().map(|a| [*a, 0.0, 0.0, 0.0]).collect();
-        self.images[0].gradients.write(&gpu, by_color_depth.len(), &alpha);
-        self.collect(rasterizer, cloud, camera, background, &Objective::Given)
+        self.images[0].gradients.write(&gpu, 0, &by_image.color_depth);
+        let alpha: Vec<[f32; 4]> = by_image.alpha.iter().map(|a| [*a, 0.0, 0.0, 0.0]).collect();
+        self.images[0].gradients.write(&gpu, by_image.color_depth.len(), &alpha);
+        self.collect(cloud, camera, background, &Objective::Given)
     }
 
     fn collect(
         &mut self,
-        rasterizer: &mut Rasterizer,
         cloud: &GpuCloud,
         camera: &ViewCamera,
         background: [f32; 3],
         objective: &Objective<'_>,
     ) -> Result<Gradients, GpuError> {
-        let gpu = rasterizer.gpu().clone();
+        let gpu = self.rasterizer.gpu().clone();
         let sink = GpuBuffer::storage(&gpu, "gradients", cloud.parameters().raw().size())?;
-        self.run(rasterizer, cloud, (camera, background), objective, &Sink::Gradient(&sink))?;
+        self.run(cloud, (camera, background), objective, &Sink::Gradient(&sink))?;
         let planes = (0..cloud.planes())
             .map(|plane| sink.read(&gpu, plane * cloud.capacity(), cloud.len()))
             .collect::<Result<Vec<_>, _>>()?;
@@ -253,21 +297,20 @@ impl Optimiser {
         Ok(Gradients { loss: LossTerms::default(), cloud, pose: tangent([pose[0], pose[1]]) })
     }
 
-    /// Submits one step and waits, again with larger buffers if its pairs did not fit.
+    /// Submits one step and waits, again with larger buffers if its intersections did not fit.
     fn run(
         &mut self,
-        rasterizer: &mut Rasterizer,
         cloud: &GpuCloud,
         view: (&ViewCamera, [f32; 3]),
         objective: &Objective<'_>,
         sink: &Sink<'_>,
     ) -> Result<(), GpuError> {
-        let gpu = rasterizer.gpu().clone();
+        let gpu = self.rasterizer.gpu().clone();
         loop {
             let mut encoder = gpu.device.create_command_encoder(&Default::default());
-            self.encode(&mut encoder, rasterizer, cloud, view, objective, sink)?;
+            self.encode(&mut encoder, cloud, view, objective, sink)?;
             gpu.queue.submit([encoder.finish()]);
-            if rasterizer.finish()?.is_some() {
+            if self.rasterizer.finish()?.is_some() {
                 return Ok(());
             }
         }
@@ -277,16 +320,15 @@ impl Optimiser {
     fn encode(
         &mut self,
         encoder: &mut wgpu::CommandEncoder,
-        rasterizer: &mut Rasterizer,
         cloud: &GpuCloud,
         (camera, background): (&ViewCamera, [f32; 3]),
         objective: &Objective<'_>,
         sink: &Sink<'_>,
     ) -> Result<(), GpuError> {
-        let gpu = rasterizer.gpu().clone();
-        let prepared = rasterizer.prepare(cloud, camera, background)?;
+        let gpu = self.rasterizer.gpu().clone();
+        let prepared = self.rasterizer.prepare(cloud, camera, background)?;
         self.reserve(&gpu, &prepared.view, cloud)?;
-        rasterizer.encode_clear(encoder);
+        self.rasterizer.encode_clear(encoder);
         if let Objective::Image { target, .. } = objective {
             self.images[0].target.encode_copy(encoder, target);
             copy(encoder, &target.tile_losses, &self.images[0].loss_sums);
@@ -295,17 +337,17 @@ impl Optimiser {
             encoder.clear_buffer(buffer.raw(), 0, None);
         }
         let mut pass = encoder.begin_compute_pass(&Default::default());
-        if let Objective::Image { loss: (loss, _), skip: Some(skip), .. } = objective {
-            self.skipped.encode_select(&mut pass, rasterizer, &self.images[0], loss, skip);
+        if let Objective::Image { loss: (loss, _), tile_sampling: Some((sampling, seed)), .. } = objective {
+            self.sampler.encode_sample(&mut pass, &self.rasterizer, &self.images[0], loss, sampling, *seed);
         }
-        rasterizer.encode_forward(&mut pass, cloud.parameters(), &prepared);
-        if let Objective::Image { loss, scored, skip, .. } = objective {
-            skip.iter().for_each(|_| self.skipped.encode_fill(&mut pass, rasterizer, &self.images[0]));
-            self.encode_loss(&mut pass, rasterizer, *loss);
+        self.rasterizer.encode_forward(&mut pass, cloud.parameters(), &prepared);
+        if let Objective::Image { loss, scored, tile_sampling, .. } = objective {
+            tile_sampling.iter().for_each(|_| self.sampler.encode_fill(&mut pass, &self.rasterizer, &self.images[0]));
+            self.encode_loss(&mut pass, *loss);
             let image = (&self.images[0].gradients, &self.loss_total);
-            scored.iter().for_each(|wrong| self.scores.encode(&mut pass, rasterizer, &prepared, image, (wrong, loss.0)));
+            scored.iter().for_each(|wrong| self.scores.encode(&mut pass, &self.rasterizer, &prepared, image, (wrong, loss.0)));
         }
-        self.encode_backward(&mut pass, rasterizer, cloud, &prepared, sink);
+        self.encode_backward(&mut pass, cloud, &prepared, sink);
         gpu.mark(&mut pass, Self::END_MARK);
         drop(pass);
         if let Objective::Image { target, .. } = objective {
@@ -314,34 +356,27 @@ impl Optimiser {
         Ok(())
     }
 
-    fn encode_loss(&self, pass: &mut wgpu::ComputePass<'_>, rasterizer: &Rasterizer, (loss, depth_trust): (&LossConfig, f32)) {
-        let (gpu, ws, k) = (rasterizer.gpu(), &rasterizer.workspace, &self.kernels);
+    fn encode_loss(&self, pass: &mut wgpu::ComputePass<'_>, (loss, depth_confidence): (&LossConfig, f32)) {
+        let (gpu, ws, k) = (self.rasterizer.gpu(), &self.rasterizer.workspace, &self.kernels);
         let TargetImage { width, height, color, depth, .. } = &self.images[0].target;
         let (width, height) = (*width, *height);
         let LossConfig { ssim_weight, depth_weight, precise_depth_metres: precise_depth } = *loss;
-        let setup = LossSetup { width, height, ssim_weight, depth_weight, precise_depth, depth_trust };
+        let setup = LossSetup { width, height, ssim_weight, depth_weight, precise_depth, depth_confidence };
         self.loss_setup.write(gpu, 0, &[setup]);
         let forward = [width.div_ceil(LOSS_TILE), height.div_ceil(LOSS_TILE / 2), 1];
         let backward = [width.div_ceil(LOSS_TILE), height.div_ceil(LOSS_TILE), 1];
         let inputs =
             [(0, &self.loss_setup), (1, &ws.color_depth), (2, &ws.state), (3, color), (4, depth), (5, &self.images[0].partials)];
-        let with = |last| inputs.iter().copied().chain([last, (7, &ws.skipped)]).collect::<Vec<_>>();
+        let with = |last| inputs.iter().copied().chain([last, (7, &ws.unsampled)]).collect::<Vec<_>>();
         k.loss_forward.dispatch(gpu, pass, &with((6, &self.images[0].loss_sums)), forward);
         k.loss_reduce.dispatch(gpu, pass, &[(0, &self.images[0].loss_sums), (1, &self.loss_total)], [1, 1, 1]);
         k.loss_backward.dispatch(gpu, pass, &with((6, &self.images[0].gradients)), backward);
     }
 
-    fn encode_backward(
-        &self,
-        pass: &mut wgpu::ComputePass<'_>,
-        rasterizer: &Rasterizer,
-        cloud: &GpuCloud,
-        prepared: &PreparedView,
-        sink: &Sink<'_>,
-    ) {
-        let (gpu, ws, k) = (rasterizer.gpu(), &rasterizer.workspace, &self.kernels);
+    fn encode_backward(&self, pass: &mut wgpu::ComputePass<'_>, cloud: &GpuCloud, prepared: &PreparedView, sink: &Sink<'_>) {
+        let (gpu, ws, k) = (self.rasterizer.gpu(), &self.rasterizer.workspace, &self.kernels);
         let blend = [
-            (0, rasterizer.view()),
+            (0, self.rasterizer.view()),
             (1, &ws.ranges),
             (2, &ws.slots[prepared.sorted]),
             (3, &ws.slot_gaussians),
@@ -349,14 +384,14 @@ impl Optimiser {
             (5, &ws.color_depth),
             (6, &ws.state),
             (7, &self.images[0].gradients),
-            (8, &ws.pair_gradients),
+            (8, &ws.intersection_gradients),
         ];
-        k.rasterize_backward.dispatch(gpu, pass, &blend, rasterizer.form().workgroups(prepared.view.tiles()));
+        k.rasterize_backward.dispatch(gpu, pass, &blend, self.rasterizer.form().workgroups(prepared.view.tiles()));
         let mut project = vec![
-            (0, rasterizer.view()),
+            (0, self.rasterizer.view()),
             (1, &ws.counters),
-            (2, &ws.pair_counts),
-            (3, &ws.pair_gradients),
+            (2, &ws.intersection_counts),
+            (3, &ws.intersection_gradients),
             (4, &self.pose_sums),
             (5, cloud.parameters()),
         ];

@@ -1,13 +1,13 @@
-// Chooses the tiles of a keyframe that a step leaves out: those whose loss is small beside the image's mean, by what it was when
-// each was last worked on. Every tile comes up now and then, so that what changes there is seen. One workgroup.
+// Draws the tiles of a keyframe that a step samples: in proportion to their loss, by what it was when each was last sampled.
+// Every tile is sampled now and then, so that changes there are seen. One workgroup.
 
-// Host twin: `render::layout::TileSkipSetup`.
-struct TileSkipSetup {
-    // A tile of mean loss is worked on in this share of the steps, one of more loss in proportion more often,
+// Host twin: `render::layout::TileSamplingSetup`.
+struct TileSamplingSetup {
+    // Share of the steps that sample a tile of mean loss; other tiles in proportion to their loss.
     share: f32,
-    // each in this share at least,
-    least: f32,
-    // and one of less loss than this, per pixel, no more often than that.
+    // Least share of the steps that sample a tile.
+    min_share: f32,
+    // Loss per pixel below which a tile is sampled in no more than the least share.
     noise: f32,
     ssim_weight: f32,
     depth_weight: f32,
@@ -16,11 +16,11 @@ struct TileSkipSetup {
 }
 
 @group(0) @binding(0) var<uniform> view: View;
-@group(0) @binding(1) var<uniform> setup: TileSkipSetup;
+@group(0) @binding(1) var<uniform> setup: TileSamplingSetup;
 // [tiles] see `loss_forward`; |colour error| is negative before the first step.
 @group(0) @binding(2) var<storage, read> tile_losses: array<vec4<f32>>;
-// [tiles / 32] one bit a tile.
-@group(0) @binding(3) var<storage, read_write> skipped: array<u32>;
+// [tiles / 32] one bit a tile, set if it is not sampled.
+@group(0) @binding(3) var<storage, read_write> unsampled: array<u32>;
 
 var<workgroup> sums: array<vec2<f32>, 256>;
 
@@ -41,12 +41,12 @@ fn main(@builtin(local_invocation_index) local: u32) {
     }
     workgroupBarrier();
     let mean = sums[0].x / max(sums[0].y, 1.0);
-    for (var word = local; word < min((tiles + 31u) / 32u, arrayLength(&skipped)); word += 256u) {
+    for (var word = local; word < min((tiles + 31u) / 32u, arrayLength(&unsampled)); word += 256u) {
         var bits = 0u;
         for (var bit = 0u; bit < min(32u, tiles - word * 32u); bit++) {
-            bits |= select(0u, 1u << bit, is_skipped(word * 32u + bit, mean));
+            bits |= select(0u, 1u << bit, is_unsampled(word * 32u + bit, mean));
         }
-        skipped[word] = bits;
+        unsampled[word] = bits;
     }
 }
 
@@ -58,13 +58,13 @@ fn loss_of(tile: u32) -> f32 {
     return select(loss, -1.0, sums.x < 0.0);
 }
 
-fn is_skipped(tile: u32, mean: f32) -> bool {
+fn is_unsampled(tile: u32, mean: f32) -> bool {
     let loss = loss_of(tile);
     let wanted = select(setup.share * loss / max(mean, 1e-12), 0.0, loss < setup.noise);
     let known = loss >= 0.0;
     // Tiles one above the other share their draw: the loss works on pairs of them.
     let block = tile / (2u * view.tiles_x) * view.tiles_x + tile % view.tiles_x;
-    return known && draw(block) >= max(wanted, setup.least);
+    return known && draw(block) >= max(wanted, setup.min_share);
 }
 
 // 0 to 1, by O'Neill's PCG hash.

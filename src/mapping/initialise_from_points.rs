@@ -3,13 +3,13 @@
 use glam::{Quat, Vec3};
 
 use super::PointsConfig;
-use super::neighbours::spacings;
+use super::knn::spacings;
 use crate::sequence::KnownPoint;
 use crate::splat::{Gaussian, GaussianCloud, ShDegree, raw_opacity_from_opacity, sh::dc_from_color};
 
 /// A Gaussian for each point; points that `f32` cannot hold are left out. Sizes stay within a factor of the median one, for a stray
 /// point far from all others would be a fog, and of two that coincide neither would be seen.
-pub(super) fn seed(points: &[KnownPoint], config: &PointsConfig, sh_degree: ShDegree) -> GaussianCloud {
+pub(super) fn gaussians(points: &[KnownPoint], config: &PointsConfig, sh_degree: ShDegree) -> GaussianCloud {
     let mut cloud = GaussianCloud::new(sh_degree);
     let of = |p: &KnownPoint| (Vec3::from(p.position.map(|v| v as f32).data.0[0]), p.color);
     let points: Vec<(Vec3, [u8; 3])> = points.iter().map(of).filter(|(position, _)| position.is_finite()).collect();
@@ -45,7 +45,7 @@ mod tests {
         let mut points: Vec<KnownPoint> = (0..25).map(|i| point(0.1 * f64::from(i % 5), 0.1 * f64::from(i / 5))).collect();
         points.extend([point(100.0, 0.0), point(0.0, 0.0), KnownPoint { position: Vector3::new(1e60, 0.0, 0.0), color: [0; 3] }]);
         let config = PointsConfig { footprint: 0.5, opacity: 0.3, size_range: 4.0, ..PointsConfig::default() };
-        let cloud = seed(&points, &config, ShDegree::new(1).unwrap());
+        let cloud = gaussians(&points, &config, ShDegree::new(1).unwrap());
         assert_eq!(cloud.len(), 27);
         assert!(cloud.first_non_finite().is_none());
         let size = |i: usize| cloud.log_scales[i].exp();
@@ -55,6 +55,6 @@ mod tests {
         let gaussian = cloud.get(3);
         assert!((crate::splat::opacity_from_raw(gaussian.raw_opacity) - 0.3).abs() < 1e-6);
         assert_eq!(gaussian.sh[0], dc_from_color(Vec3::new(1.0, 128.0 / 255.0, 0.0)));
-        assert!(seed(&[], &config, ShDegree::default()).is_empty());
+        assert!(gaussians(&[], &config, ShDegree::default()).is_empty());
     }
 }

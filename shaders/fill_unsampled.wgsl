@@ -1,7 +1,7 @@
-// Where a step left a tile out, takes the image for as recorded: its neighbours' SSIM needs something to compare. One workgroup a tile.
+// Copies the recorded image into unsampled tiles: its neighbours' SSIM needs something to compare. One workgroup a tile.
 
 @group(0) @binding(0) var<uniform> view: View;
-@group(0) @binding(1) var<uniform> skipped: SkippedTiles;
+@group(0) @binding(1) var<uniform> unsampled: UnsampledTiles;
 @group(0) @binding(2) var<storage, read> target_color: array<u32>;
 // [H, W] see `rasterize_forward`.
 @group(0) @binding(3) var<storage, read_write> color_depth: array<vec4<f32>>;
@@ -15,7 +15,7 @@ fn main(
     @builtin(local_invocation_index) local: u32,
 ) {
     let tile = linear_workgroup(workgroup, workgroups);
-    if tile >= view.tiles_x * view.tiles_y || !is_bit_set(skipped.bits[tile / 128u % 1024u], tile) {
+    if tile >= view.tiles_x * view.tiles_y || !is_bit_set(unsampled.bits[tile / 128u % 1024u], tile) {
         return;
     }
     let first = vec2(tile % view.tiles_x * TILE_WIDTH, tile / view.tiles_x * TILE_HEIGHT);

@@ -4,12 +4,12 @@
 //! Unlike the released code: pruning is decided first and by order of score, without a draw; a pixel is wrong by a multiple of the mean
 //! error, not by the view's extremes; ages are per Gaussian.
 
-use super::{Candidate, VcdConfig, Verdict};
+use super::{Candidate, MultiViewConfig, Verdict};
 
 /// Views that must have shown a Gaussian before it can be called useless.
 const MIN_VIEWS: u32 = 3;
 
-pub(super) fn judge(candidates: &[Candidate], config: &VcdConfig) -> Vec<Verdict> {
+pub(super) fn judge(candidates: &[Candidate], config: &MultiViewConfig) -> Vec<Verdict> {
     let faint_limit = median_score_of_faint(candidates, config);
     let mut verdicts: Vec<Verdict> =
         candidates.iter().map(|c| if is_useless(c, faint_limit, config) { Verdict::Remove } else { Verdict::Keep }).collect();
@@ -23,12 +23,12 @@ pub(super) fn judge(candidates: &[Candidate], config: &VcdConfig) -> Vec<Verdict
     verdicts
 }
 
-fn is_faint(c: &Candidate, config: &VcdConfig) -> bool {
-    c.score.views > 0.0 && c.entry.age >= config.min_age && c.opacity() < config.faint_opacity
+fn is_faint(c: &Candidate, config: &MultiViewConfig) -> bool {
+    c.score.views > 0.0 && c.history.age >= config.min_age && c.opacity() < config.faint_opacity
 }
 
 /// The pruning score above which a faint Gaussian goes: the median of theirs.
-fn median_score_of_faint(candidates: &[Candidate], config: &VcdConfig) -> f32 {
+fn median_score_of_faint(candidates: &[Candidate], config: &MultiViewConfig) -> f32 {
     let faint = candidates.iter().filter(|c| is_faint(c, config));
     let mut scores: Vec<f32> = faint.map(|c| c.score.weighted_wrong_pixels).collect();
     scores.sort_by(f32::total_cmp);
@@ -36,18 +36,18 @@ fn median_score_of_faint(candidates: &[Candidate], config: &VcdConfig) -> f32 {
 }
 
 /// Nothing would be missed without it, or it is faint and stands in the way.
-fn is_useless(c: &Candidate, faint_limit: f32, config: &VcdConfig) -> bool {
-    let adds_little = c.entry.best_weight < config.min_weight || c.entry.worth < config.min_worth;
-    let never_seen_well = c.entry.views >= MIN_VIEWS && adds_little;
+fn is_useless(c: &Candidate, faint_limit: f32, config: &MultiViewConfig) -> bool {
+    let adds_little = c.history.best_weight < config.min_weight || c.history.contribution < config.min_contribution;
+    let never_seen_well = c.history.views >= MIN_VIEWS && adds_little;
     let in_the_way = is_faint(c, config) && c.score.weighted_wrong_pixels > faint_limit;
-    c.entry.age >= config.min_age && (never_seen_well || in_the_way)
+    c.history.age >= config.min_age && (never_seen_well || in_the_way)
 }
 
 /// Several views agree that it is too coarse for what they show.
-fn is_wrong(c: &Candidate, config: &VcdConfig) -> bool {
+fn is_wrong(c: &Candidate, config: &MultiViewConfig) -> bool {
     let views = c.score.views;
     views > 0.0
-        && c.entry.age >= config.min_age
+        && c.history.age >= config.min_age
         && c.score.wrong_pixels / views > config.wrong_pixels
         && c.score.absolute_gradient / views > config.absolute_gradient
         && c.pixels() > config.split_pixels
