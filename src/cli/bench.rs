@@ -173,7 +173,11 @@ fn step(args: &StepArgs) -> miette::Result<()> {
             }
         }
     }
-    let text = serde_json::to_string_pretty(&report).into_diagnostic()?;
+    write(&report, args)
+}
+
+fn write(report: &Report, args: &StepArgs) -> miette::Result<()> {
+    let text = serde_json::to_string_pretty(report).into_diagnostic()?;
     if let Some(path) = &args.out {
         keysplat::files::write_atomically(path, text.as_bytes()).into_diagnostic()?;
     }

@@ -79,11 +79,10 @@ enum Change {
 /// The figures that differ by more than their margins.
 fn changes(expected: &Figures, found: &Figures, margins: &Margins) -> Vec<Change> {
     let mut changes = Vec::new();
-    // A comparison with NaN is false; it must count as worse.
     let mut quality = |name, gain: f64, margin: f64| {
         if gain > margin {
             changes.push(Change::Better(name));
-        } else if !(gain >= -margin) {
+        } else if gain.is_nan() || gain < -margin {
             changes.push(Change::Worse(name));
         }
     };
