@@ -9,7 +9,6 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use fastrand::Rng;
-use glam::{Quat, Vec3};
 use image::RgbImage;
 use serde::{Deserialize, Serialize};
 
@@ -23,13 +22,13 @@ use super::plane_sweep::{self, SourceView};
 use super::refine_poses::RefinedPair;
 use super::schedule::{self, Session, Step};
 use super::{
-    DensityStrategy, Keyframe, KeyframeId, LimitsConfig, MappingConfig, RefinePosesConfig, exposure, initialise_from_points,
-    insertion, limits,
+    DensityConfig, DensityStrategy, Keyframe, KeyframeId, LimitsConfig, MappingConfig, RefinePosesConfig, exposure,
+    initialise_from_points, insertion, limits,
 };
 use crate::geometry::Se3;
 use crate::gpu::{Gpu, GpuError};
-use crate::optimise::{GaussianScore, StepReport, Trainer, TrainingView, WrongPixels};
-use crate::render::{GpuCloud, Rendered};
+use crate::optimise::{AdamConfig, GaussianScore, StepReport, Trainer, TrainingView, WrongPixels};
+use crate::render::{GpuCloud, Plan, Rendered};
 use crate::sequence::{KnownPoint, RectifiedImage};
 use crate::splat::{Exposure, GaussianCloud, ViewCamera};
 
@@ -75,7 +74,8 @@ pub struct KeyframeReport {
 /// Seeds, optimises and prunes the map.
 #[derive(Debug)]
 pub struct Mapper {
-    config: MappingConfig,
+    /// As resolved; no phase changes it.
+    config: Arc<MappingConfig>,
     gpu: Arc<Gpu>,
     trainer: Trainer,
     cloud: GpuCloud,
@@ -88,7 +88,7 @@ pub struct Mapper {
 impl Mapper {
     pub fn new(gpu: Arc<Gpu>, config: &MappingConfig) -> Result<Self, MappingError> {
         Ok(Self {
-            config: config.clone(),
+            config: Arc::new(config.clone()),
             trainer: Trainer::new(gpu.clone())?,
             cloud: GpuCloud::new(&gpu, config.sh_degree, FIRST_CAPACITY)?,
             stats: GaussianStats::default(),
@@ -181,6 +181,11 @@ impl Mapper {
         &self.step_times
     }
 
+    /// Whether any step has moved the map: before, its colours are those of single pixels.
+    fn is_trained(&self) -> bool {
+        !self.step_times.is_empty()
+    }
+
     /// Whether it has passed over all keyframes so far.
     pub fn has_not_begun(&self) -> bool {
         self.keyframes.is_empty() && self.cloud.is_empty()
@@ -219,7 +224,7 @@ impl Mapper {
     /// The exposure of an image of which the map shows `rendered`. A map that no step has moved yet shows nothing that counts.
     fn exposure(&self, image: &RgbImage, rendered: Option<&Rendered>) -> Exposure {
         let (config, last) = (&self.config.exposure, self.keyframes.last().map_or(Exposure::default(), |k| k.exposure));
-        let shown = rendered.filter(|_| config.enabled && !self.step_times.is_empty());
+        let shown = rendered.filter(|_| config.enabled && self.is_trained());
         shown.map_or(last, |rendered| exposure::measure(image, rendered, &last, config))
     }
 
@@ -233,8 +238,9 @@ impl Mapper {
             self.cloud.limit(most);
             new = new.thinned(limits::insertions_allowed(new.len(), most));
             let keep = limits::most_useful(self.stats.histories(), most - new.len());
-            self.cloud.change(&self.gpu, &keep, (&[], &[]))?;
-            self.stats.apply(&keep, std::iter::empty());
+            let plan = Plan::keeping(keep);
+            self.cloud.apply(&self.gpu, &plan)?;
+            self.stats.apply(&plan);
         }
         let left_out = self.cloud.append(&self.gpu, &new)?;
         self.stats.append(keyframe.id, new.len() - left_out);
@@ -261,36 +267,29 @@ impl Mapper {
     }
 
     /// Whether, and by what, Gaussians are scored: for control of their density, or to know which to give up.
-    fn scoring(&self) -> Option<WrongPixels> {
-        let wanted = self.config.density.strategy != DensityStrategy::None || self.config.limits.limits_gaussians();
-        wanted.then(|| self.config.density.wrong_pixels())
+    fn scoring(&self, density: &DensityConfig) -> Option<WrongPixels> {
+        let wanted = density.strategy != DensityStrategy::None || self.config.limits.limits_gaussians();
+        wanted.then(|| density.wrong_pixels())
     }
 
     /// Removes and divides Gaussians by the scores of the steps just taken; returns how many fewer and how many more there are for it.
-    fn control_density(&mut self) -> Result<(usize, usize), MappingError> {
+    fn control_density(&mut self, density: &DensityConfig) -> Result<(usize, usize), MappingError> {
         if self.cloud.is_empty() {
             return Ok((0, 0));
         }
-        let scores = match self.scoring() {
+        let scores = match self.scoring(density) {
             Some(_) => self.trainer.read_scores(&self.cloud)?,
             None => vec![GaussianScore::default(); self.cloud.len()],
         };
         self.stats.scored(&scores);
-        let [geometry, scales, rotations] = [0, 1, 2].map(|plane| self.cloud.read_plane(&self.gpu, plane));
-        let (geometry, scales, rotations) = (geometry?, scales?, rotations?);
-        let candidate = |i: usize| {
-            let ([x, y, z, raw_opacity], [a, b, c, _], [qw, qx, qy, qz]) = (geometry[i], scales[i], rotations[i]);
-            let (mean, log_scale, rotation) = (Vec3::new(x, y, z), Vec3::new(a, b, c), Quat::from_xyzw(qx, qy, qz, qw));
-            Candidate { mean, raw_opacity, log_scale, rotation, score: scores[i], history: self.stats.histories()[i] }
-        };
-        let candidates: Vec<Candidate> = (0..self.cloud.len()).map(candidate).collect();
-        let plan = density::plan(&candidates, self.most_gaussians(), &self.config.density);
+        let geometry = self.cloud.read_geometry(&self.gpu)?;
+        let histories = self.stats.histories();
+        let candidates: Vec<Candidate> =
+            (0..self.cloud.len()).map(|i| Candidate { geometry: geometry[i], score: scores[i], history: histories[i] }).collect();
+        let plan = density::plan(&candidates, self.most_gaussians(), density);
         let (before, children) = (self.cloud.len(), plan.children.len());
-        let geometry = |c: &density::Child| [c.mean.extend(c.raw_opacity).into(), c.log_scale.extend(0.0).into()];
-        let parents: Vec<u32> = plan.children.iter().map(|c| c.parent).collect();
-        let geometry: Vec<[[f32; 4]; 2]> = plan.children.iter().map(geometry).collect();
-        self.cloud.change(&self.gpu, &plan.keep, (&parents, &geometry))?;
-        self.stats.apply(&plan.keep, parents.into_iter());
+        self.cloud.apply(&self.gpu, &plan)?;
+        self.stats.apply(&plan);
         // Two children take their parent's place.
         Ok((before - plan.keep.len() - children / 2, children / 2))
     }
@@ -302,16 +301,18 @@ impl Mapper {
             return Ok(KeyframeReport::default());
         }
         let window = schedule::window(&self.keyframes, &self.config.window);
-        let density = &self.config.density;
+        let config = self.config.clone();
+        let density = &config.density;
         let controlled = self.keyframes.len().is_multiple_of(density.every);
         // The scored steps are among the steps.
-        let scored = self.scoring().filter(|_| controlled).map_or(0, |_| density.views.min(window.len()).min(iterations));
+        let scored = self.scoring(density).filter(|_| controlled).map_or(0, |_| density.views.min(window.len()).min(iterations));
         let unscored = iterations - scored;
         let mut session = Session::new(window.clone(), unscored);
         let due = (density.after_share * unscored as f32).round() as usize;
         let before = self.steps_of(&mut session, due, stop)?;
         self.stats.keyframe_mapped();
-        let (scored, (pruned, grown)) = if controlled { (self.score(&window)?, self.control_density()?) } else { (0, (0, 0)) };
+        let (scored, (pruned, grown)) =
+            if controlled { (self.score(&window, density, &config.adam)?, self.control_density(density)?) } else { (0, (0, 0)) };
         let after = self.steps_of(&mut session, unscored, stop)?;
         let done = before.0 + after.0;
         let psnr_db = (before.1 + after.1) / done.max(1) as f32;
@@ -325,7 +326,8 @@ impl Mapper {
         while !session.is_over(end) && !stop() {
             let count = most.min(end - session.taken());
             let batch = session.next(count, &self.keyframes, &mut self.rng, &self.config.window, &self.config.schedule);
-            let reports = self.steps(&batch, None)?;
+            let adam = &self.config.clone().adam;
+            let reports = self.steps(&batch, None, adam)?;
             self.refine_poses(session.window(), &batch, &reports);
             psnr_sum += reports.iter().map(|r| r.loss.psnr_db()).sum::<f32>();
             done += batch.len();
@@ -345,10 +347,10 @@ impl Mapper {
     }
 
     /// A last step of each of some keyframes of the window, evenly spread over it, that scores the Gaussians; returns their number.
-    fn score(&mut self, window: &[usize]) -> Result<usize, MappingError> {
-        let Some(wrong) = self.scoring() else { return Ok(0) };
+    fn score(&mut self, window: &[usize], density: &DensityConfig, adam: &AdamConfig) -> Result<usize, MappingError> {
+        let Some(wrong) = self.scoring(density) else { return Ok(0) };
         self.trainer.begin_scores(&self.cloud)?;
-        let views = self.config.density.views.min(window.len());
+        let views = density.views.min(window.len());
         let chosen: Vec<Step> = (0..views)
             .map(|k| Step {
                 keyframe: window[k * window.len() / views],
@@ -356,10 +358,10 @@ impl Mapper {
                 lr_scale: self.config.window.final_lr_scale,
             })
             .collect();
-        Ok(self.steps(&chosen, Some(wrong))?.len())
+        Ok(self.steps(&chosen, Some(wrong), adam)?.len())
     }
 
-    fn steps(&mut self, batch: &[Step], scored: Option<WrongPixels>) -> Result<Vec<StepReport>, MappingError> {
+    fn steps(&mut self, batch: &[Step], scored: Option<WrongPixels>, adam: &AdamConfig) -> Result<Vec<StepReport>, MappingError> {
         // A pose is refined by its whole image.
         let tile_sampling = self.config.tile_sampling.sampling().filter(|_| !self.config.refine_poses.enabled);
         let view = |step: &Step| {
@@ -370,7 +372,7 @@ impl Mapper {
         };
         let views: Vec<TrainingView<'_>> = batch.iter().map(view).collect();
         let started = Instant::now();
-        let reports = self.trainer.steps(&self.cloud, &views, &self.config.loss, &self.config.adam)?;
+        let reports = self.trainer.steps(&self.cloud, &views, &self.config.loss, adam)?;
         self.step_times.extend(std::iter::repeat_n(started.elapsed() / batch.len().max(1) as u32, batch.len()));
         for (step, report) in batch.iter().zip(&reports) {
             let keyframe = &mut self.keyframes[step.keyframe];

@@ -34,6 +34,53 @@ pub struct GpuCloud {
     gather: Kernel,
 }
 
+/// One Gaussian without its colour: raw parameters, averaged over its recent steps.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct GaussianGeometry {
+    /// World, metres.
+    pub mean: Vec3,
+    /// Logit of the opacity.
+    pub raw_opacity: f32,
+    /// Natural logarithm of the standard deviations along the Gaussian's own axes, metres.
+    pub log_scale: Vec3,
+    /// World from Gaussian, not necessarily of unit length.
+    pub rotation: Quat,
+}
+
+/// A new Gaussian: its parent with another position, opacity and scale.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Child {
+    /// Index of the parent before the plan is applied.
+    pub parent: u32,
+    /// World, metres.
+    pub mean: Vec3,
+    /// Logit of the opacity.
+    pub raw_opacity: f32,
+    /// Natural logarithm of the standard deviations, metres.
+    pub log_scale: Vec3,
+}
+
+/// A change of the set of Gaussians; indices are those before it.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Plan {
+    /// Gaussians that stay, ascending.
+    pub keep: Vec<u32>,
+    /// Gaussians that are appended.
+    pub children: Vec<Child>,
+}
+
+impl Plan {
+    /// A plan that only removes.
+    pub fn keeping(keep: Vec<u32>) -> Self {
+        Self { keep, children: Vec::new() }
+    }
+
+    /// The parent of each child.
+    pub fn parents(&self) -> impl Iterator<Item = u32> + '_ {
+        self.children.iter().map(|child| child.parent)
+    }
+}
+
 /// A map with its moments and averages, read back.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct CloudState {
@@ -138,24 +185,28 @@ impl GpuCloud {
         Ok(cloud.len() - finite.len())
     }
 
-    /// Keeps the Gaussians at `keep` (ascending indices) and appends a copy of each of `parents` with its own position, raw opacity and log
-    /// scale (planes 0 and 1). All keep their moments: a child goes on at its parent's lr_scale.
-    pub fn change(&mut self, gpu: &Gpu, keep: &[u32], (parents, geometry): (&[u32], &[[[f32; 4]; 2]])) -> Result<(), GpuError> {
-        let sources: Vec<u32> = keep.iter().chain(parents).copied().collect();
+    /// Applies a plan to the parameters, their averages and the moments. A child inherits its parent's moments.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit.
+    pub fn apply(&mut self, gpu: &Gpu, plan: &Plan) -> Result<(), GpuError> {
+        let sources: Vec<u32> = plan.keep.iter().copied().chain(plan.parents()).collect();
         let capacity = self.capacity_for(gpu, sources.len());
-        if keep.len() == self.count && parents.is_empty() && capacity == self.capacity {
+        if plan.keep.len() == self.count && plan.children.is_empty() && capacity == self.capacity {
             return Ok(());
         }
         self.rebuild(gpu, &sources, capacity)?;
-        for plane in 0..2 {
-            let values: Vec<[f32; 4]> = geometry.iter().map(|g| g[plane]).collect();
-            self.parameters.write(gpu, plane * self.capacity + keep.len(), &values);
-            self.averages.write(gpu, plane * self.capacity + keep.len(), &values);
+        let first = plan.keep.len();
+        let positions: Vec<[f32; 4]> = plan.children.iter().map(|c| c.mean.extend(c.raw_opacity).into()).collect();
+        let scales: Vec<[f32; 4]> = plan.children.iter().map(|c| c.log_scale.extend(0.0).into()).collect();
+        for (plane, values) in [positions, scales].iter().enumerate() {
+            self.parameters.write(gpu, plane * self.capacity + first, values);
+            self.averages.write(gpu, plane * self.capacity + first, values);
         }
         Ok(())
     }
 
-    /// Capacity for `needed` Gaussians: the present one, or twice as much within the limit and what the adapter can bind; if that is too
+    /// Room for `needed` Gaussians: the present one, or twice as much within the limit and what the adapter can bind; if that is too
     /// little, the allocation says how much is needed.
     fn capacity_for(&self, gpu: &Gpu, needed: usize) -> usize {
         let limit = self.limit.unwrap_or(usize::MAX).max(needed);
@@ -241,8 +292,23 @@ impl GpuCloud {
         [&self.parameters, &self.moments_1, &self.moments_2, &self.averages]
     }
 
-    /// Reads one plane of the map as it is shown, `[count]`: of the averages.
-    pub fn read_plane(&self, gpu: &Gpu, plane: usize) -> Result<Vec<[f32; 4]>, GpuError> {
+    /// Downloads the averaged geometry of all Gaussians, `[N]` in map order. Blocks until the GPU is idle.
+    ///
+    /// # Errors
+    /// [`GpuError`] if the device fails.
+    pub fn read_geometry(&self, gpu: &Gpu) -> Result<Vec<GaussianGeometry>, GpuError> {
+        let [positions, scales, rotations] = [0, 1, 2].map(|plane| self.read_plane(gpu, plane));
+        let (positions, scales, rotations) = (positions?, scales?, rotations?);
+        let geometry = |i: usize| {
+            let ([x, y, z, raw_opacity], [a, b, c, _], [qw, qx, qy, qz]) = (positions[i], scales[i], rotations[i]);
+            let (mean, log_scale, rotation) = (Vec3::new(x, y, z), Vec3::new(a, b, c), Quat::from_xyzw(qx, qy, qz, qw));
+            GaussianGeometry { mean, raw_opacity, log_scale, rotation }
+        };
+        Ok((0..self.count).map(geometry).collect())
+    }
+
+    /// Reads one plane of the averages, `[N]`.
+    fn read_plane(&self, gpu: &Gpu, plane: usize) -> Result<Vec<[f32; 4]>, GpuError> {
         self.averages.read(gpu, plane * self.capacity, self.count)
     }
 

@@ -7,7 +7,8 @@ pub(crate) mod shaders;
 mod sort;
 mod workspace;
 
-pub use cloud::{CloudState, GpuCloud, cloud_from_planes};
+pub(crate) use cloud::cloud_from_planes;
+pub use cloud::{Child, CloudState, GaussianGeometry, GpuCloud, Plan};
 pub use layout::BlendForm;
 pub use rasterizer::{PreparedView, Rasterizer, Rendered, ViewCounts};
 pub use shaders::{SHADERS, ShaderSource};
