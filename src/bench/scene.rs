@@ -49,7 +49,8 @@ impl BenchScene {
         gpu: &Arc<Gpu>,
         cloud: &GaussianCloud,
         camera: ViewCamera,
-        (color, depth_metres): (&RgbImage, Option<&[f32]>),
+        color: &RgbImage,
+        depth_metres: Option<&[f32]>,
     ) -> Result<Self, GpuError> {
         let mut on_gpu = GpuCloud::new(gpu, cloud.sh_degree, cloud.len())?;
         on_gpu.append(gpu, cloud)?;

@@ -1,6 +1,7 @@
 //! The mapper: owns the Gaussians, their moments and the keyframe window.
 
 mod refine;
+mod relative_poses;
 mod state;
 
 use std::borrow::Cow;
@@ -22,8 +23,8 @@ use super::plane_sweep::{self, SourceView};
 use super::refine_poses::RefinedPair;
 use super::schedule::{self, Session, Step};
 use super::{
-    DensityConfig, DensityStrategy, Keyframe, KeyframeId, LimitsConfig, MappingConfig, RefinePosesConfig, exposure,
-    initialise_from_points, insertion, limits,
+    DensityConfig, DensityStrategy, Keyframe, KeyframeId, LimitsConfig, MappingConfig, exposure, initialise_from_points,
+    insertion, limits,
 };
 use crate::geometry::Se3;
 use crate::gpu::{Gpu, GpuError};
@@ -163,7 +164,11 @@ impl Mapper {
         if !self.config.refine_poses.enabled || self.keyframes.is_empty() {
             return Vec::new();
         }
-        relative_poses(&self.keyframes, &schedule::window(&self.keyframes, &self.config.window), &self.config.refine_poses)
+        relative_poses::refined(
+            &self.keyframes,
+            &schedule::window(&self.keyframes, &self.config.window),
+            &self.config.refine_poses,
+        )
     }
 
     /// The map as it is now.
@@ -383,26 +388,4 @@ impl Mapper {
         }
         Ok(reports)
     }
-}
-
-/// The window's keyframes, each relative to the one of the window with which it shares most, where both have been refined.
-fn relative_poses(keyframes: &[MappedKeyframe], window: &[usize], config: &RefinePosesConfig) -> Vec<RefinedPair> {
-    // The first keyframe is the world, and right by definition.
-    let refined = |k: usize| k == 0 || keyframes[k].refinement.is_informative();
-    let partner = |k: usize| {
-        let of_window = |id: &KeyframeId| window.iter().copied().find(|w| keyframes[*w].id == *id);
-        keyframes[k].covisible.iter().filter_map(of_window).find(|w| refined(*w))
-    };
-    let pair = |(k, other): (usize, usize)| {
-        let (keyframe, relative) = (&keyframes[k], &keyframes[other]);
-        let sigma_rotation_rad = config.sigma_pixels / keyframe.camera.pinhole.fx;
-        RefinedPair {
-            keyframe: keyframe.id,
-            relative_to: relative.id,
-            keyframe_from_relative: keyframe.camera.camera_from_world * relative.camera.camera_from_world.inverse(),
-            sigma_translation_metres: sigma_rotation_rad * keyframe.depth_metres,
-            sigma_rotation_rad,
-        }
-    };
-    window.iter().filter(|k| refined(**k)).filter_map(|k| Some((*k, partner(*k)?))).map(pair).collect()
 }

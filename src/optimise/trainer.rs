@@ -1,5 +1,6 @@
 //! One training step on the GPU: forward, loss, backward, Adam; and the same without stepping, for whoever wants the gradients.
 
+mod encode;
 mod state;
 
 use std::sync::Arc;
@@ -9,14 +10,14 @@ pub use state::TrainerState;
 
 use bytemuck::{Pod, Zeroable};
 
-use super::image_buffers::{self, ImageBuffers, LOSS_TILE};
+use super::image_buffers::{self, ImageBuffers};
 use super::kernels::Kernels;
-use super::scores::{GaussianScore, Scores, WrongPixels};
+use super::scores::{GaussianScore, ScoredImage, Scores, WrongPixels};
 use super::tile_sampling::{TileSampler, TileSampling};
 use super::{AdamConfig, LossConfig, LossTerms, TargetImage};
 use crate::gpu::{Gpu, GpuBuffer, GpuError};
-use crate::render::layout::{AdamSetup, COUNTERS, Counter, LossSetup, VISIBLE_COUNTER, View};
-use crate::render::{BlendForm, GpuCloud, PreparedView, Rasterizer, Rendered, ViewCounts, cloud_from_planes};
+use crate::render::layout::{AdamSetup, COUNTERS, Counter, LossSetup, View};
+use crate::render::{BlendForm, GpuCloud, Rasterizer, Rendered, ViewCounts, cloud_from_planes};
 use crate::splat::{GaussianCloud, ViewCamera};
 
 /// What a step did.
@@ -238,16 +239,6 @@ impl Trainer {
         self.encode_time
     }
 
-    fn encode_log(&self, encoder: &mut wgpu::CommandEncoder, log: &GpuBuffer, entry: usize) {
-        let to = (entry * std::mem::size_of::<StepLog>()) as u64;
-        let counters = &self.rasterizer.workspace.counters;
-        let [pose_at, counters_at] =
-            [std::mem::offset_of!(StepLog, pose), std::mem::offset_of!(StepLog, counters)].map(|at| at as u64);
-        encoder.copy_buffer_to_buffer(self.loss_total.raw(), 0, log.raw(), to, pose_at);
-        encoder.copy_buffer_to_buffer(self.pose_gradient.raw(), 0, log.raw(), to + pose_at, counters_at - pose_at);
-        encoder.copy_buffer_to_buffer(counters.raw(), 0, log.raw(), to + counters_at, counters.raw().size());
-    }
-
     /// The same, but returns the gradients and moves nothing.
     pub fn gradients(
         &mut self,
@@ -343,9 +334,9 @@ impl Trainer {
         self.rasterizer.encode_forward(&mut pass, cloud.parameters(), &prepared);
         if let Objective::Image { loss, scored, tile_sampling, .. } = objective {
             tile_sampling.iter().for_each(|_| self.sampler.encode_fill(&mut pass, &self.rasterizer, &self.images[0]));
-            self.encode_loss(&mut pass, *loss);
-            let image = (&self.images[0].gradients, &self.loss_total);
-            scored.iter().for_each(|wrong| self.scores.encode(&mut pass, &self.rasterizer, &prepared, image, (wrong, loss.0)));
+            self.encode_loss(&mut pass, loss.0, loss.1);
+            let image = ScoredImage { gradients: &self.images[0].gradients, loss_total: &self.loss_total, loss: loss.0 };
+            scored.iter().for_each(|wrong| self.scores.encode(&mut pass, &self.rasterizer, &prepared, &image, wrong));
         }
         self.encode_backward(&mut pass, cloud, &prepared, sink);
         gpu.mark(&mut pass, Self::END_MARK);
@@ -354,61 +345,6 @@ impl Trainer {
             copy(encoder, &self.images[0].loss_sums, &target.tile_losses);
         }
         Ok(())
-    }
-
-    fn encode_loss(&self, pass: &mut wgpu::ComputePass<'_>, (loss, depth_confidence): (&LossConfig, f32)) {
-        let (gpu, ws, k) = (self.rasterizer.gpu(), &self.rasterizer.workspace, &self.kernels);
-        let TargetImage { width, height, color, depth, .. } = &self.images[0].target;
-        let (width, height) = (*width, *height);
-        let LossConfig { ssim_weight, depth_weight, precise_depth_metres: precise_depth } = *loss;
-        let setup = LossSetup { width, height, ssim_weight, depth_weight, precise_depth, depth_confidence };
-        self.loss_setup.write(gpu, 0, &[setup]);
-        let forward = [width.div_ceil(LOSS_TILE), height.div_ceil(LOSS_TILE / 2), 1];
-        let backward = [width.div_ceil(LOSS_TILE), height.div_ceil(LOSS_TILE), 1];
-        let inputs =
-            [(0, &self.loss_setup), (1, &ws.color_depth), (2, &ws.state), (3, color), (4, depth), (5, &self.images[0].partials)];
-        let with = |last| inputs.iter().copied().chain([last, (7, &ws.unsampled)]).collect::<Vec<_>>();
-        k.loss_forward.dispatch(gpu, pass, &with((6, &self.images[0].loss_sums)), forward);
-        k.loss_reduce.dispatch(gpu, pass, &[(0, &self.images[0].loss_sums), (1, &self.loss_total)], [1, 1, 1]);
-        k.loss_backward.dispatch(gpu, pass, &with((6, &self.images[0].gradients)), backward);
-    }
-
-    fn encode_backward(&self, pass: &mut wgpu::ComputePass<'_>, cloud: &GpuCloud, prepared: &PreparedView, sink: &Sink<'_>) {
-        let (gpu, ws, k) = (self.rasterizer.gpu(), &self.rasterizer.workspace, &self.kernels);
-        let blend = [
-            (0, self.rasterizer.view()),
-            (1, &ws.ranges),
-            (2, &ws.slots[prepared.sorted]),
-            (3, &ws.slot_gaussians),
-            (4, &ws.projected),
-            (5, &ws.color_depth),
-            (6, &ws.state),
-            (7, &self.images[0].gradients),
-            (8, &ws.intersection_gradients),
-        ];
-        k.rasterize_backward.dispatch(gpu, pass, &blend, self.rasterizer.form().workgroups(prepared.view.tiles()));
-        let mut project = vec![
-            (0, self.rasterizer.view()),
-            (1, &ws.counters),
-            (2, &ws.intersection_counts),
-            (3, &ws.intersection_gradients),
-            (4, &self.pose_sums),
-            (5, cloud.parameters()),
-        ];
-        let arguments = (&ws.counters, Counter::per_element_offset(VISIBLE_COUNTER));
-        let kernel = match sink {
-            Sink::Adam => {
-                project.extend([(6, cloud.moments_1()), (7, cloud.moments_2()), (8, &self.adam), (9, cloud.averages())]);
-                &k.project_backward_adam
-            }
-            Sink::Gradient(buffer) => {
-                project.push((6, *buffer));
-                &k.project_backward
-            }
-        };
-        kernel.dispatch_indirect(gpu, pass, &project, arguments);
-        let reduce = [(0, &ws.counters), (1, &self.pose_sums), (2, &self.pose_gradient)];
-        k.pose_reduce.dispatch(gpu, pass, &reduce, [1, 1, 1]);
     }
 
     fn read_loss(&self, gpu: &Gpu, target: &TargetImage) -> Result<LossTerms, GpuError> {

@@ -10,7 +10,7 @@ use bytemuck::Zeroable;
 use super::cloud::GpuCloud;
 use super::layout::{BlendForm, COUNTERS, Counter, INTERSECTION_COUNTER, ScanSetup, TileListsSetup, VISIBLE_COUNTER, View};
 use super::shaders;
-use super::sort::{Scan, ScanJob, Sort};
+use super::sort::{Scan, ScanJob, Sort, SortJob};
 use super::workspace::{Capacities, Workspace};
 use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, workgroups};
 use crate::splat::{Exposure, ViewCamera};
@@ -150,7 +150,7 @@ impl Rasterizer {
     pub fn prepare(&mut self, cloud: &GpuCloud, camera: &ViewCamera, background: [f32; 3]) -> Result<PreparedView, GpuError> {
         let mut view = View::new(camera, background);
         self.workspace.reserve_gaussians(&self.gpu, cloud.capacity())?;
-        self.workspace.reserve_image(&self.gpu, (view.pixels(), view.tiles()))?;
+        self.workspace.reserve_image(&self.gpu, view.pixels(), view.tiles())?;
         view.gaussian_count = cloud.len() as u32;
         // All per-Gaussian buffers of the workspace are at least as long as the map's planes, whose stride both share.
         view.capacity = cloud.capacity() as u32;
@@ -195,7 +195,8 @@ impl Rasterizer {
             (6, &ws.intersection_counts),
         ];
         k.compact_visible.dispatch(gpu, pass, &compact, per_gaussian);
-        k.sort.encode(gpu, pass, ws, (&ws.depth_keys, &ws.order), (VISIBLE_COUNTER, DEPTH_KEY_BITS));
+        let by_depth = SortJob { keys: &ws.depth_keys, values: &ws.order, counter: VISIBLE_COUNTER, bits: DEPTH_KEY_BITS };
+        k.sort.encode(gpu, pass, ws, &by_depth);
         self.encode_tiles(pass, prepared);
         let bindings = [
             (0, uniform),
@@ -235,7 +236,8 @@ impl Rasterizer {
         k.scan.encode(gpu, pass, ws, &job);
         k.tile_lists.dispatch_indirect(gpu, pass, &lists(&self.emit_mode), visible);
         let tile_bits = u32::BITS - prepared.view.tiles().leading_zeros();
-        let sorted = k.sort.encode(gpu, pass, ws, (&ws.tile_keys, &ws.slots), (INTERSECTION_COUNTER, tile_bits));
+        let by_tile = SortJob { keys: &ws.tile_keys, values: &ws.slots, counter: INTERSECTION_COUNTER, bits: tile_bits };
+        let sorted = k.sort.encode(gpu, pass, ws, &by_tile);
         debug_assert_eq!(sorted, prepared.sorted);
         let ranges = [(0, &ws.counters), (1, &ws.tile_keys[sorted]), (2, &ws.ranges)];
         k.tile_ranges.dispatch_indirect(gpu, pass, &ranges, (&ws.counters, Counter::per_element_offset(INTERSECTION_COUNTER)));
