@@ -39,9 +39,13 @@ pub enum GpuError {
 /// What identifies an adapter in metrics and lists.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct AdapterSummary {
+    /// Name of the adapter.
     pub name: String,
+    /// Graphics API: `vulkan`, `metal` or `dx12`.
     pub backend: String,
+    /// `discrete`, `integrated`, `virtual`, `cpu` or `other`.
     pub kind: String,
+    /// Name and version of the driver.
     pub driver: String,
 }
 
@@ -66,8 +70,11 @@ impl From<wgpu::AdapterInfo> for AdapterSummary {
 /// A device with its queue, and what is known of it.
 #[derive(Debug)]
 pub struct Gpu {
+    /// The wgpu device.
     pub device: wgpu::Device,
+    /// The queue of the device.
     pub queue: wgpu::Queue,
+    /// Identity of the adapter.
     pub adapter: AdapterSummary,
     failure: Arc<Mutex<Option<Failure>>>,
     pub(super) memory: Arc<MemoryCount>,

@@ -1,5 +1,6 @@
 //! The mapper: owns the Gaussians, their moments and the keyframe window.
 
+mod control;
 mod refine;
 mod relative_poses;
 mod state;
@@ -16,19 +17,15 @@ use serde::{Deserialize, Serialize};
 pub use refine::{FinalRefinement, RefineReport};
 pub use state::MapperState;
 
-use super::density::{self, Candidate};
 use super::gaussian_stats::{self, GaussianStats};
 use super::keyframe::{DepthSource, MappedKeyframe};
 use super::plane_sweep::{self, SourceView};
 use super::refine_poses::RefinedPair;
 use super::schedule::{self, Session, Step};
-use super::{
-    DensityConfig, DensityStrategy, Keyframe, KeyframeId, LimitsConfig, MappingConfig, exposure, initialise_from_points,
-    insertion, limits,
-};
+use super::{Keyframe, KeyframeId, LimitsConfig, MappingConfig, exposure, initialise_from_points, insertion, limits};
 use crate::geometry::Se3;
 use crate::gpu::{Gpu, GpuError};
-use crate::optimise::{AdamConfig, GaussianScore, StepReport, Trainer, TrainingView, WrongPixels};
+use crate::optimise::{AdamConfig, StepReport, Trainer, TrainingView, WrongPixels};
 use crate::render::{GpuCloud, Plan, Rendered};
 use crate::sequence::{KnownPoint, RectifiedImage};
 use crate::splat::{Exposure, GaussianCloud, ViewCamera};
@@ -40,6 +37,7 @@ const BATCH: usize = 10;
 /// Fewer where others wait for the machine.
 const YIELDING_BATCH: usize = 3;
 
+/// Failure of the mapper.
 #[derive(Debug, thiserror::Error)]
 pub enum MappingError {
     #[error(transparent)]
@@ -57,13 +55,17 @@ pub enum MappingError {
 /// What happened to a keyframe.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct KeyframeReport {
+    /// The keyframe.
     pub id: KeyframeId,
     /// Gaussians inserted.
     pub inserted: usize,
+    /// Gaussians removed.
     pub pruned: usize,
     /// Gaussians that came by dividing others.
     pub grown: usize,
+    /// Gaussians in the map afterwards.
     pub gaussians: usize,
+    /// Optimisation steps taken.
     pub iterations: usize,
     /// Mean PSNR of the steps' views before each step.
     pub psnr_db: f32,
@@ -87,6 +89,10 @@ pub struct Mapper {
 }
 
 impl Mapper {
+    /// An empty map on `gpu`.
+    ///
+    /// # Errors
+    /// [`MappingError`] if a buffer does not fit or the device fails.
     pub fn new(gpu: Arc<Gpu>, config: &MappingConfig) -> Result<Self, MappingError> {
         Ok(Self {
             config: Arc::new(config.clone()),
@@ -102,6 +108,9 @@ impl Mapper {
 
     /// Takes in a keyframe: inserts what the map lacks, optimises over the window, prunes. `stop` is asked between the steps. A keyframe without
     /// depth is passed over until there is a map.
+    ///
+    /// # Errors
+    /// [`MappingError`] if a buffer does not fit or the device fails.
     pub fn insert(&mut self, keyframe: &Keyframe, stop: &dyn Fn() -> bool) -> Result<KeyframeReport, MappingError> {
         if keyframe.image.depth.is_none() && self.has_not_begun() {
             return Ok(KeyframeReport { id: keyframe.id, ..KeyframeReport::default() });
@@ -133,6 +142,9 @@ impl Mapper {
     }
 
     /// Takes in points of the scene that are known before any keyframe, in the keyframes' world; `anchor` is the first of these.
+    ///
+    /// # Errors
+    /// [`MappingError`] if a buffer does not fit or the device fails.
     pub fn add_points(&mut self, known: &[KnownPoint], anchor: KeyframeId) -> Result<(), MappingError> {
         let new = initialise_from_points::gaussians(known, &self.config.points, self.config.sh_degree);
         let left_out = self.cloud.append(&self.gpu, &new)?;
@@ -142,6 +154,9 @@ impl Mapper {
 
     /// Moves earlier keyframes to better poses, and with those that move far the Gaussians inserted from them; returns how many. Unknown
     /// ids are those that were never sent to the mapper.
+    ///
+    /// # Errors
+    /// [`MappingError`] if a buffer does not fit or the device fails.
     pub fn update_poses(&mut self, updates: &[(KeyframeId, Se3)]) -> Result<usize, MappingError> {
         let mut motions = BTreeMap::new();
         let updates: BTreeMap<KeyframeId, &Se3> = updates.iter().map(|(id, pose)| (*id, pose)).collect();
@@ -171,12 +186,18 @@ impl Mapper {
         )
     }
 
-    /// The map as it is now.
+    /// Downloads the averaged parameters of all Gaussians. Blocks until the GPU is idle.
+    ///
+    /// # Errors
+    /// [`MappingError`] if a buffer does not fit or the device fails.
     pub fn download(&self) -> Result<GaussianCloud, MappingError> {
         Ok(self.cloud.download(&self.gpu)?)
     }
 
     /// Renders the map over black.
+    ///
+    /// # Errors
+    /// [`MappingError`] if a buffer does not fit or the device fails.
     pub fn render(&mut self, camera: &ViewCamera) -> Result<Rendered, MappingError> {
         Ok(self.trainer.render(&self.cloud, camera, [0.0; 3])?)
     }
@@ -196,6 +217,7 @@ impl Mapper {
         self.keyframes.is_empty() && self.cloud.is_empty()
     }
 
+    /// Number of Gaussians in the map.
     pub fn gaussians(&self) -> usize {
         self.cloud.len()
     }
@@ -271,34 +293,6 @@ impl Mapper {
         }
     }
 
-    /// Whether, and by what, Gaussians are scored: for control of their density, or to know which to give up.
-    fn scoring(&self, density: &DensityConfig) -> Option<WrongPixels> {
-        let wanted = density.strategy != DensityStrategy::None || self.config.limits.limits_gaussians();
-        wanted.then(|| density.wrong_pixels())
-    }
-
-    /// Removes and divides Gaussians by the scores of the steps just taken; returns how many fewer and how many more there are for it.
-    fn control_density(&mut self, density: &DensityConfig) -> Result<(usize, usize), MappingError> {
-        if self.cloud.is_empty() {
-            return Ok((0, 0));
-        }
-        let scores = match self.scoring(density) {
-            Some(_) => self.trainer.read_scores(&self.cloud)?,
-            None => vec![GaussianScore::default(); self.cloud.len()],
-        };
-        self.stats.scored(&scores);
-        let geometry = self.cloud.read_geometry(&self.gpu)?;
-        let histories = self.stats.histories();
-        let candidates: Vec<Candidate> =
-            (0..self.cloud.len()).map(|i| Candidate { geometry: geometry[i], score: scores[i], history: histories[i] }).collect();
-        let plan = density::plan(&candidates, self.most_gaussians(), density);
-        let (before, children) = (self.cloud.len(), plan.children.len());
-        self.cloud.apply(&self.gpu, &plan)?;
-        self.stats.apply(&plan);
-        // Two children take their parent's place.
-        Ok((before - plan.keep.len() - children / 2, children / 2))
-    }
-
     /// Steps over the window until all are taken or nothing more is gained; on the way some of them score the Gaussians, whose density is
     /// then controlled. Reports what it did.
     fn optimise(&mut self, iterations: usize, stop: &dyn Fn() -> bool) -> Result<KeyframeReport, MappingError> {
@@ -349,21 +343,6 @@ impl Mapper {
         for (step, report) in batch.iter().zip(reports).filter(|(step, _)| moves(step)) {
             self.keyframes[step.keyframe].refine(&report.pose, step.lr_scale, config);
         }
-    }
-
-    /// A last step of each of some keyframes of the window, evenly spread over it, that scores the Gaussians; returns their number.
-    fn score(&mut self, window: &[usize], density: &DensityConfig, adam: &AdamConfig) -> Result<usize, MappingError> {
-        let Some(wrong) = self.scoring(density) else { return Ok(0) };
-        self.trainer.begin_scores(&self.cloud)?;
-        let views = density.views.min(window.len());
-        let chosen: Vec<Step> = (0..views)
-            .map(|k| Step {
-                keyframe: window[k * window.len() / views],
-                coarse: false,
-                lr_scale: self.config.window.final_lr_scale,
-            })
-            .collect();
-        Ok(self.steps(&chosen, Some(wrong), adam)?.len())
     }
 
     fn steps(&mut self, batch: &[Step], scored: Option<WrongPixels>, adam: &AdamConfig) -> Result<Vec<StepReport>, MappingError> {

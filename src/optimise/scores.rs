@@ -25,10 +25,12 @@ pub struct GaussianScore {
     pub weighted_wrong_pixels: f32,
     /// Sum and maximum of what it added to a pixel, 0 to 1.
     pub weight_sum: f32,
+    /// Maximum of the blending weights, 0 to 1.
     pub weight_max: f32,
     /// Sums over the views of the loss gradient by its image position, and of the sums of absolute gradients over its pixels;
     /// normalised device coordinates, as 3DGS has them.
     pub gradient: f32,
+    /// Sum of absolute image-position gradients, normalised device coordinates.
     pub absolute_gradient: f32,
     /// Views that blended it.
     pub views: f32,

@@ -23,7 +23,9 @@ use crate::splat::{GaussianCloud, ViewCamera};
 /// What a step did.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct StepReport {
+    /// Terms of the image loss.
     pub loss: LossTerms,
+    /// Work of the view.
     pub counts: ViewCounts,
     /// Gradient of the loss by the pose before the step, as in [`Gradients`].
     pub pose: [f32; 6],
@@ -32,7 +34,9 @@ pub struct StepReport {
 /// A view to learn from.
 #[derive(Clone, Copy, Debug)]
 pub struct TrainingView<'a> {
+    /// Pose and intrinsics.
     pub camera: ViewCamera,
+    /// Recorded image and depth.
     pub target: &'a TargetImage,
     /// Whether the step also scores the Gaussians (see [`Trainer::begin_scores`]).
     pub scored: Option<WrongPixels>,
@@ -63,6 +67,7 @@ struct StepLog {
 /// Gradient of a loss by the map and by the pose.
 #[derive(Clone, Debug)]
 pub struct Gradients {
+    /// Terms of the image loss.
     pub loss: LossTerms,
     /// By the raw parameters of each Gaussian, in the shape of the map.
     pub cloud: GaussianCloud,
@@ -161,6 +166,9 @@ impl Trainer {
     /// For each view in turn: renders the map, compares it with the target, and moves the Gaussians that were blended by one step of
     /// Adam. The steps are submitted without waiting in between; what they report is read at the end. A step whose intersections did not
     /// fit moved nothing and is repeated after the others, with larger buffers.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn steps(
         &mut self,
         cloud: &GpuCloud,
@@ -225,11 +233,17 @@ impl Trainer {
     }
 
     /// Forgets all scores: from here on, steps of scored views add to those of `cloud`, which must not grow or shrink meanwhile.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn begin_scores(&mut self, cloud: &GpuCloud) -> Result<(), GpuError> {
         self.scores.clear(self.rasterizer.gpu(), cloud)
     }
 
     /// The scores since [`Self::begin_scores`], `[N]` in map order.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn read_scores(&self, cloud: &GpuCloud) -> Result<Vec<GaussianScore>, GpuError> {
         self.scores.read(self.rasterizer.gpu(), cloud)
     }
@@ -240,6 +254,9 @@ impl Trainer {
     }
 
     /// The same, but returns the gradients and moves nothing.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn gradients(
         &mut self,
         cloud: &GpuCloud,
@@ -255,6 +272,9 @@ impl Trainer {
     }
 
     /// Gradients of any loss by the map and the pose, from its gradients by the image; moves nothing.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn gradients_from_image(
         &mut self,
         cloud: &GpuCloud,

@@ -7,6 +7,7 @@ use nalgebra::Point3;
 use serde::{Deserialize, Serialize};
 
 use super::layout::{BlendForm, GEOMETRY_PLANES, GatherSetup};
+use super::plan::{GaussianGeometry, Plan};
 use super::shaders;
 use crate::geometry::Se3;
 use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, plain, workgroups};
@@ -34,53 +35,6 @@ pub struct GpuCloud {
     gather: Kernel,
 }
 
-/// One Gaussian without its colour: raw parameters, averaged over its recent steps.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct GaussianGeometry {
-    /// World, metres.
-    pub mean: Vec3,
-    /// Logit of the opacity.
-    pub raw_opacity: f32,
-    /// Natural logarithm of the standard deviations along the Gaussian's own axes, metres.
-    pub log_scale: Vec3,
-    /// World from Gaussian, not necessarily of unit length.
-    pub rotation: Quat,
-}
-
-/// A new Gaussian: its parent with another position, opacity and scale.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Child {
-    /// Index of the parent before the plan is applied.
-    pub parent: u32,
-    /// World, metres.
-    pub mean: Vec3,
-    /// Logit of the opacity.
-    pub raw_opacity: f32,
-    /// Natural logarithm of the standard deviations, metres.
-    pub log_scale: Vec3,
-}
-
-/// A change of the set of Gaussians; indices are those before it.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct Plan {
-    /// Gaussians that stay, ascending.
-    pub keep: Vec<u32>,
-    /// Gaussians that are appended.
-    pub children: Vec<Child>,
-}
-
-impl Plan {
-    /// A plan that only removes.
-    pub fn keeping(keep: Vec<u32>) -> Self {
-        Self { keep, children: Vec::new() }
-    }
-
-    /// The parent of each child.
-    pub fn parents(&self) -> impl Iterator<Item = u32> + '_ {
-        self.children.iter().map(|child| child.parent)
-    }
-}
-
 /// A map with its moments and averages, read back.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct CloudState {
@@ -93,6 +47,9 @@ pub struct CloudState {
 
 impl GpuCloud {
     /// An empty map with room for `capacity` Gaussians; it grows as needed.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn new(gpu: &Gpu, sh_degree: ShDegree, capacity: usize) -> Result<Self, GpuError> {
         let capacity = capacity.max(256);
         let planes = || allocate(gpu, sh_degree, capacity);
@@ -110,18 +67,22 @@ impl GpuCloud {
         })
     }
 
+    /// Number of Gaussians.
     pub fn len(&self) -> usize {
         self.count
     }
 
+    /// Whether there are no Gaussians.
     pub fn is_empty(&self) -> bool {
         self.count == 0
     }
 
+    /// Gaussians that the buffers have space for.
     pub fn capacity(&self) -> usize {
         self.capacity
     }
 
+    /// Degree of the spherical harmonics.
     pub fn sh_degree(&self) -> ShDegree {
         self.sh_degree
     }
@@ -146,14 +107,17 @@ impl GpuCloud {
         planes(self.sh_degree)
     }
 
+    /// Raw parameters, `[planes, capacity]` vec4.
     pub fn parameters(&self) -> &GpuBuffer {
         &self.parameters
     }
 
+    /// First moments of Adam, `[planes, capacity]` vec4.
     pub fn moments_1(&self) -> &GpuBuffer {
         &self.moments_1
     }
 
+    /// Second moments of Adam, `[planes, capacity]` vec4.
     pub fn moments_2(&self) -> &GpuBuffer {
         &self.moments_2
     }
@@ -164,6 +128,9 @@ impl GpuCloud {
     }
 
     /// Appends Gaussians with zero moments. Those that hold a NaN or an infinity are left out; their number is returned.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn append(&mut self, gpu: &Gpu, cloud: &GaussianCloud) -> Result<usize, GpuError> {
         assert_eq!(cloud.sh_degree, self.sh_degree, "a map has one spherical-harmonics degree");
         let finite: Vec<usize> = (0..cloud.len()).filter(|&i| is_finite(cloud, i)).collect();
@@ -219,6 +186,9 @@ impl GpuCloud {
 
     /// Moves runs of Gaussians rigidly (new_from_old, in the world) and forgets their moments, which belong to where they were. On the
     /// host: this is rare. The harmonics above the constant stay as they are, for a closed loop turns little.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn transform(&mut self, gpu: &Gpu, runs: &[(Range<usize>, Se3)]) -> Result<(), GpuError> {
         if runs.is_empty() {
             return Ok(());
@@ -313,12 +283,18 @@ impl GpuCloud {
     }
 
     /// Reads the whole map as it is shown.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn download(&self, gpu: &Gpu) -> Result<GaussianCloud, GpuError> {
         let read = (0..self.planes()).map(|plane| self.read_plane(gpu, plane)).collect::<Result<Vec<_>, _>>()?;
         Ok(cloud_from_planes(self.sh_degree, &read))
     }
 
     /// All that training needs to go on as if it had never stopped.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn state(&self, gpu: &Gpu) -> Result<CloudState, GpuError> {
         let mut values = Vec::with_capacity(BUFFERS * self.planes() * self.count);
         for buffer in self.buffers() {
@@ -330,6 +306,9 @@ impl GpuCloud {
     }
 
     /// The map of a state, to the bit; `None` if that is no map of this degree.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn restore(gpu: &Gpu, sh_degree: ShDegree, state: &CloudState) -> Result<Option<Self>, GpuError> {
         let planes = planes(sh_degree);
         let count = state.values.len() / (BUFFERS * planes);

@@ -2,14 +2,16 @@
 
 mod cloud;
 pub mod layout;
+mod plan;
 mod rasterizer;
 pub(crate) mod shaders;
 mod sort;
 mod workspace;
 
 pub(crate) use cloud::cloud_from_planes;
-pub use cloud::{Child, CloudState, GaussianGeometry, GpuCloud, Plan};
+pub use cloud::{CloudState, GpuCloud};
 pub use layout::BlendForm;
+pub use plan::{Child, GaussianGeometry, Plan};
 pub use rasterizer::{PreparedView, Rasterizer, Rendered, ViewCounts};
 pub use shaders::{SHADERS, ShaderSource};
 pub use workspace::Capacities;

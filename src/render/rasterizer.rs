@@ -21,7 +21,9 @@ const DEPTH_KEY_BITS: u32 = 32;
 /// A rendered view on the host.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Rendered {
+    /// Pixels along x.
     pub width: u32,
+    /// Pixels along y.
     pub height: u32,
     /// `[H, W]` colour over the background, and Σ w z in metres.
     pub color_depth: Vec<[f32; 4]>,
@@ -50,7 +52,9 @@ impl Rendered {
 /// Counts of a rendered view.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ViewCounts {
+    /// Gaussians that reach the image.
     pub visible: u32,
+    /// Intersections of Gaussians with tiles.
     pub intersections: u32,
 }
 
@@ -84,6 +88,7 @@ pub struct Rasterizer {
 /// A view prepared for encoding, and where its sorted intersections will lie.
 #[derive(Clone, Copy, Debug)]
 pub struct PreparedView {
+    /// Constants of the view, as uploaded.
     pub view: View,
     /// Which of `workspace.slots` holds the sorted intersections.
     pub sorted: usize,
@@ -91,12 +96,18 @@ pub struct PreparedView {
 
 impl Rasterizer {
     /// With the form of the blending passes that suits the adapter.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn new(gpu: Arc<Gpu>) -> Result<Self, GpuError> {
         let form = BlendForm::of(&gpu);
         Self::with_form(gpu, form)
     }
 
     /// With a given form of the blending passes.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn with_form(gpu: Arc<Gpu>, form: BlendForm) -> Result<Self, GpuError> {
         let kernel = |source: &shaders::ShaderSource| Kernel::new(&gpu, source.name, "main", &source.text(form));
         let kernels = Kernels {
@@ -123,6 +134,7 @@ impl Rasterizer {
         })
     }
 
+    /// The device that it runs on.
     pub fn gpu(&self) -> &Arc<Gpu> {
         &self.gpu
     }
@@ -132,6 +144,7 @@ impl Rasterizer {
         &self.view
     }
 
+    /// The form of the blending passes.
     pub fn form(&self) -> BlendForm {
         self.form
     }
@@ -142,11 +155,17 @@ impl Rasterizer {
     }
 
     /// Reserves scratch buffers of the given capacities.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn reserve(&mut self, capacities: Capacities) -> Result<(), GpuError> {
         self.workspace.reserve(&self.gpu, capacities)
     }
 
     /// Reserves buffers for the view and uploads it; it must be submitted before another is prepared.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn prepare(&mut self, cloud: &GpuCloud, camera: &ViewCamera, background: [f32; 3]) -> Result<PreparedView, GpuError> {
         let mut view = View::new(camera, background);
         self.workspace.reserve_gaussians(&self.gpu, cloud.capacity())?;
@@ -245,6 +264,9 @@ impl Rasterizer {
     }
 
     /// Reads the counters of the last view; when its intersections did not fit, grows the buffers and returns `None`: repeat the step.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn finish(&mut self) -> Result<Option<ViewCounts>, GpuError> {
         let counters: Vec<Counter> = self.workspace.counters.read(&self.gpu, 0, COUNTERS as usize)?;
         let counts = self.counts(&counters);
@@ -260,6 +282,9 @@ impl Rasterizer {
     }
 
     /// Enlarges the intersection buffers to what the counters of a view need.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn reserve_for(&mut self, counters: &[Counter]) -> Result<(), GpuError> {
         let needed = counters[INTERSECTION_COUNTER as usize].needed as usize;
         if needed > self.workspace.intersection_capacity {
@@ -270,6 +295,9 @@ impl Rasterizer {
     }
 
     /// Renders a view and reads it back.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn render(&mut self, cloud: &GpuCloud, camera: &ViewCamera, background: [f32; 3]) -> Result<Rendered, GpuError> {
         loop {
             let prepared = self.prepare(cloud, camera, background)?;

@@ -26,8 +26,11 @@ pub struct FinalRefinement {
 pub struct RefineReport {
     /// Steps since the beginning of the refinement.
     pub steps_done: usize,
+    /// Gaussians removed in this round.
     pub pruned: usize,
+    /// Gaussians added by splitting in this round.
     pub grown: usize,
+    /// Gaussians in the map afterwards.
     pub gaussians: usize,
     /// Mean PSNR of the round's views before each step.
     pub psnr_db: f32,
@@ -48,12 +51,18 @@ impl FinalRefinement {
 
 impl Mapper {
     /// Begins a refinement over the keyframes so far; none may come until it is done.
+    ///
+    /// # Errors
+    /// [`MappingError`] if a buffer does not fit or the device fails.
     pub fn begin_refinement(&mut self) -> Result<FinalRefinement, MappingError> {
         let config = self.config.refine.clone();
         Ok(FinalRefinement { adam: self.config.adam.clone(), config, done: 0, epoch: Vec::new(), rounds: 0 })
     }
 
     /// The steps up to the next density control, and that; `None` when all are done, or `stop` says so.
+    ///
+    /// # Errors
+    /// [`MappingError`] if a buffer does not fit or the device fails.
     pub fn refine(
         &mut self,
         refinement: &mut FinalRefinement,
