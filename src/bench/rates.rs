@@ -24,6 +24,9 @@ const FLOPS_PER_INVOCATION: f64 = 16_384.0;
 const BUSY_S: f64 = 0.05;
 
 /// Measures both rates; the best of a few runs each.
+///
+/// # Errors
+/// [`GpuError`] if a buffer does not fit or the device fails.
 pub fn measure_rates(gpu: &Gpu) -> Result<Rates, GpuError> {
     let text = shaders::RATES.text(BlendForm::default());
     let copy = Kernel::new(gpu, "copy_memory", "copy_memory", &text);

@@ -21,13 +21,19 @@ const LAYERS: f32 = 2.0;
 /// A map, a camera, and what the camera should have seen.
 #[derive(Debug)]
 pub struct BenchScene {
+    /// The map.
     pub cloud: GpuCloud,
+    /// The view.
     pub camera: ViewCamera,
+    /// The recorded image.
     pub target: TargetImage,
 }
 
 impl BenchScene {
     /// `count` Gaussians in view at `width`×`height`.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn new(gpu: &Arc<Gpu>, count: usize, (width, height): (u32, u32), sh_degree: ShDegree) -> Result<Self, GpuError> {
         let mut rng = Rng::with_seed(count as u64);
         let focal = f64::from(width) * 0.8;
@@ -45,11 +51,15 @@ impl BenchScene {
     }
 
     /// A map from a view that was recorded.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn of_map(
         gpu: &Arc<Gpu>,
         cloud: &GaussianCloud,
         camera: ViewCamera,
-        (color, depth_metres): (&RgbImage, Option<&[f32]>),
+        color: &RgbImage,
+        depth_metres: Option<&[f32]>,
     ) -> Result<Self, GpuError> {
         let mut on_gpu = GpuCloud::new(gpu, cloud.sh_degree, cloud.len())?;
         on_gpu.append(gpu, cloud)?;

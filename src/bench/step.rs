@@ -17,9 +17,13 @@ use crate::splat::ShDegree;
 /// What to measure.
 #[derive(Clone, Copy, Debug, Serialize)]
 pub struct StepBench {
+    /// Gaussians in the map.
     pub gaussians: usize,
+    /// Pixels along x.
     pub width: u32,
+    /// Pixels along y.
     pub height: u32,
+    /// Degree of the spherical harmonics.
     pub sh_degree: ShDegree,
     /// Form of the blending passes.
     pub form: BlendForm,
@@ -32,6 +36,7 @@ pub struct StepBench {
 /// One stage: what it took, and what the adapter would need at its best for the bytes and operations that it must move and do.
 #[derive(Clone, Debug, Serialize)]
 pub struct StageReport {
+    /// Name of the stage.
     pub stage: String,
     /// Median over batches of steps; absent where the adapter gives no timestamps.
     pub ms: f64,
@@ -42,15 +47,19 @@ pub struct StageReport {
 /// The measured step.
 #[derive(Clone, Debug, Serialize)]
 pub struct StepReport {
+    /// The measured configuration.
     pub bench: StepBench,
+    /// Work of one step.
     pub work: Work,
     /// Wall time per step, submitted in batches: median.
     pub step_ms: f64,
+    /// Sum of the stages' floors, milliseconds.
     pub floor_ms: f64,
     /// The host's time to encode and submit a step, while the GPU works on others.
     pub encode_ms: f64,
     /// Forward evaluations per second of `rasterize_forward`.
     pub evaluations_per_s: Option<f64>,
+    /// The stages, by name.
     pub stages: Vec<StageReport>,
 }
 
@@ -83,6 +92,9 @@ pub struct StepTimes {
 
 impl StepRunner {
     /// `gpu` should be opened with [`Gpu::open_profiled`]. Compiles and warms up.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn new(
         gpu: &Arc<Gpu>,
         scene: BenchScene,
@@ -109,6 +121,9 @@ impl StepRunner {
     }
 
     /// Runs a batch of steps and waits for them.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn run(&mut self) -> Result<StepTimes, GpuError> {
         let share = BATCH as u32;
         let encoded = self.trainer.encode_time();
@@ -126,6 +141,9 @@ impl StepRunner {
 }
 
 /// Measures a training step on a scene.
+///
+/// # Errors
+/// [`GpuError`] if a buffer does not fit or the device fails.
 pub fn bench_step(gpu: &Arc<Gpu>, scene: BenchScene, bench: &StepBench, rates: &Rates) -> Result<StepReport, GpuError> {
     let mut runner = StepRunner::new(gpu, scene, bench.form, bench.tile_sampling)?;
     let times = (0..bench.steps.div_ceil(BATCH)).map(|_| runner.run()).collect::<Result<Vec<_>, _>>()?;

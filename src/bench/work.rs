@@ -12,8 +12,11 @@ use crate::splat::model::{ALPHA_MAX, TRANSMITTANCE_MIN, ViewCamera};
 /// Counted work of one view.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 pub struct Work {
+    /// Gaussians in the map.
     pub gaussians: u64,
+    /// Gaussians that reach the image.
     pub visible: u64,
+    /// Intersections of Gaussians with tiles.
     pub intersections: u64,
     /// (Gaussian, pixel) pairs whose exponent is computed in the forward pass: a tile's Gaussians times its pixels, until all its
     /// pixels are finished.
@@ -22,7 +25,9 @@ pub struct Work {
     pub blended: u64,
     /// Evaluations up to each tile's last contributor: the backward pass's share.
     pub backward_evaluations: u64,
+    /// Pixels of the image.
     pub pixels: u64,
+    /// Tiles of the image.
     pub tiles: u64,
 }
 
@@ -34,6 +39,9 @@ struct TileWork {
 }
 
 /// Renders the view once more and counts.
+///
+/// # Errors
+/// [`GpuError`] if a buffer does not fit or the device fails.
 pub fn count_work(trainer: &mut Trainer, cloud: &GpuCloud, camera: &ViewCamera) -> Result<Work, GpuError> {
     let rasterizer = trainer.rasterizer_mut();
     let rendered = rasterizer.render(cloud, camera, [0.0; 3])?;

@@ -157,7 +157,7 @@ fn step(args: &StepArgs) -> miette::Result<()> {
             let Pinhole { width, height, .. } = view.image.pinhole;
             let camera = ViewCamera { pinhole: view.image.pinhole, camera_from_world: view.world_from_camera.inverse() };
             let depth = view.image.depth.as_ref().map(|depth| depth.metres.as_slice());
-            let scene = BenchScene::of_map(&gpu, &cloud, camera, (&view.image.color, depth));
+            let scene = BenchScene::of_map(&gpu, &cloud, camera, &view.image.color, depth);
             let sh_degree = cloud.sh_degree;
             measure(
                 scene,

@@ -19,18 +19,27 @@ pub struct GpuBuffer {
 
 impl GpuBuffer {
     /// Storage of `bytes` (rounded up, zeroed) that can be written, copied and used for indirect dispatch.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn storage(gpu: &Gpu, label: &str, bytes: u64) -> Result<Self, GpuError> {
         let usage = BufferUsages::STORAGE | BufferUsages::COPY_DST | BufferUsages::COPY_SRC | BufferUsages::INDIRECT;
         Self::create(gpu, label, bytes, usage, gpu.max_storage_bytes())
     }
 
     /// Storage that other shaders read as a uniform: a few numbers that one pass computes for the next.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn computed_uniform(gpu: &Gpu, label: &str, bytes: u64) -> Result<Self, GpuError> {
         let usage = BufferUsages::STORAGE | BufferUsages::UNIFORM | BufferUsages::COPY_SRC | BufferUsages::COPY_DST;
         Self::create(gpu, label, bytes, usage, gpu.device.limits().max_uniform_buffer_binding_size)
     }
 
     /// A uniform that holds `value`.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn uniform<T: Pod>(gpu: &Gpu, label: &str, value: &T) -> Result<Self, GpuError> {
         let bytes = std::mem::size_of::<T>() as u64;
         let limit = gpu.device.limits().max_uniform_buffer_binding_size;
@@ -54,6 +63,7 @@ impl GpuBuffer {
         &self.identity
     }
 
+    /// The wgpu buffer.
     pub fn raw(&self) -> &wgpu::Buffer {
         &self.raw
     }
@@ -66,6 +76,9 @@ impl GpuBuffer {
     }
 
     /// Waits for all work and reads `count` elements from element `first` on.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn read<T: Pod>(&self, gpu: &Gpu, first: usize, count: usize) -> Result<Vec<T>, GpuError> {
         let element = std::mem::size_of::<T>();
         let bytes = (count * element) as u64;

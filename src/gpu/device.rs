@@ -8,6 +8,7 @@ use wgpu::{Backends, InstanceDescriptor, InstanceFlags};
 
 use super::profile::Profiler;
 
+/// Failure of the adapter, the device or an allocation on it.
 #[derive(Debug, thiserror::Error)]
 pub enum GpuError {
     #[error(
@@ -18,6 +19,12 @@ pub enum GpuError {
     NoSuchAdapter { wanted: String, found: String },
     #[error("the adapter {adapter} gives no device: {source}")]
     Device { adapter: String, source: wgpu::RequestDeviceError },
+    #[error(
+        "the device's limit `{limit}` is {offered}, but keysplat needs {needed}; request `Gpu::required_limits` of the adapter"
+    )]
+    MissingLimit { limit: &'static str, needed: u64, offered: u64 },
+    #[error("the adapter lacks {0}, which keysplat needs")]
+    MissingCapability(String),
     #[error(
         "{label}: a buffer of {} MiB is needed, but the adapter binds at most {} MiB; lower the mapping resolution (--map-scale) or the number of Gaussians",
         needed.div_ceil(1 << 20), limit >> 20
@@ -32,9 +39,13 @@ pub enum GpuError {
 /// What identifies an adapter in metrics and lists.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct AdapterSummary {
+    /// Name of the adapter.
     pub name: String,
+    /// Graphics API: `vulkan`, `metal` or `dx12`.
     pub backend: String,
+    /// `discrete`, `integrated`, `virtual`, `cpu` or `other`.
     pub kind: String,
+    /// Name and version of the driver.
     pub driver: String,
 }
 
@@ -59,8 +70,11 @@ impl From<wgpu::AdapterInfo> for AdapterSummary {
 /// A device with its queue, and what is known of it.
 #[derive(Debug)]
 pub struct Gpu {
+    /// The wgpu device.
     pub device: wgpu::Device,
+    /// The queue of the device.
     pub queue: wgpu::Queue,
+    /// Identity of the adapter.
     pub adapter: AdapterSummary,
     failure: Arc<Mutex<Option<Failure>>>,
     pub(super) memory: Arc<MemoryCount>,
@@ -118,16 +132,25 @@ pub fn adapters() -> Vec<AdapterSummary> {
 
 impl Gpu {
     /// Opens the fastest adapter, or the first whose name contains `wanted` (any case).
+    ///
+    /// # Errors
+    /// [`GpuError`] if no such adapter exists or it gives no device.
     pub fn open(wanted: Option<&str>) -> Result<Arc<Self>, GpuError> {
         Self::open_with(wanted, wgpu::Features::empty(), u64::MAX)
     }
 
     /// The same, with timestamps where the adapter has them (see [`Self::take_profile`]).
+    ///
+    /// # Errors
+    /// [`GpuError`] if no such adapter exists or it gives no device.
     pub fn open_profiled(wanted: Option<&str>) -> Result<Arc<Self>, GpuError> {
         Self::open_with(wanted, Profiler::FEATURES, u64::MAX)
     }
 
     /// The same as [`Self::open`], on an adapter made smaller: no buffer may be larger than `bytes`.
+    ///
+    /// # Errors
+    /// [`GpuError`] if no such adapter exists or it gives no device.
     pub fn open_small(wanted: Option<&str>, bytes: u64) -> Result<Arc<Self>, GpuError> {
         Self::open_with(wanted, wgpu::Features::empty(), bytes)
     }
@@ -146,22 +169,54 @@ impl Gpu {
                 .ok_or_else(|| GpuError::NoSuchAdapter { wanted: wanted.into(), found: names.join(", ") })?,
         };
         let adapter = adapters.swap_remove(index);
-        // Everything runs within WebGPU's defaults; only the sizes of buffers are asked for in full.
-        let offered = adapter.limits();
+        let full = Self::required_limits(&adapter);
         let required_limits = wgpu::Limits {
-            max_buffer_size: offered.max_buffer_size.min(most),
-            max_storage_buffer_binding_size: offered.max_storage_buffer_binding_size.min(most),
-            ..wgpu::Limits::default()
+            max_buffer_size: full.max_buffer_size.min(most),
+            max_storage_buffer_binding_size: full.max_storage_buffer_binding_size.min(most),
+            ..full
         };
         let required_features = wished & adapter.features();
         let descriptor =
             wgpu::DeviceDescriptor { label: Some("keysplat"), required_features, required_limits, ..Default::default() };
         let (device, queue) = pollster::block_on(adapter.request_device(&descriptor))
             .map_err(|source| GpuError::Device { adapter: names[index].clone(), source })?;
+        Ok(Self::watched(&adapter, device, queue, required_features.contains(Profiler::FEATURES)))
+    }
+
+    /// Limits to request for a device that is passed to [`Self::from_device`]: WebGPU's defaults, and buffers as large as the adapter
+    /// allows.
+    pub fn required_limits(adapter: &wgpu::Adapter) -> wgpu::Limits {
+        let offered = adapter.limits();
+        wgpu::Limits {
+            max_buffer_size: offered.max_buffer_size,
+            max_storage_buffer_binding_size: offered.max_storage_buffer_binding_size,
+            ..wgpu::Limits::default()
+        }
+    }
+
+    /// A GPU on the device of the embedding program, which may go on using it and its queue.
+    ///
+    /// The device needs no features, and the limits of [`Self::required_limits`]; smaller buffers only limit the map. Its handlers of
+    /// uncaptured errors and of loss are replaced: from then on these errors are returned as [`GpuError`]. Indirect dispatches are
+    /// faster if the instance was created without `InstanceFlags::VALIDATION_INDIRECT_CALL`.
+    ///
+    /// # Errors
+    /// [`GpuError::MissingLimit`] or [`GpuError::MissingCapability`] for the first thing that the device or its adapter lacks.
+    pub fn from_device(adapter: &wgpu::Adapter, device: wgpu::Device, queue: wgpu::Queue) -> Result<Arc<Self>, GpuError> {
+        let needed = wgpu::DownlevelFlags::COMPUTE_SHADERS | wgpu::DownlevelFlags::INDIRECT_EXECUTION;
+        let missing = needed - adapter.get_downlevel_capabilities().flags;
+        if !missing.is_empty() {
+            return Err(GpuError::MissingCapability(format!("{missing:?}")));
+        }
+        check_limits(&device.limits())?;
+        Ok(Self::watched(adapter, device, queue, false))
+    }
+
+    fn watched(adapter: &wgpu::Adapter, device: wgpu::Device, queue: wgpu::Queue, profiled: bool) -> Arc<Self> {
         let failure = Arc::new(Mutex::new(None));
         watch(&device, &failure);
-        let profiler = required_features.contains(Profiler::FEATURES).then(|| Profiler::new(&device));
-        Ok(Arc::new(Self { device, queue, adapter: adapter.get_info().into(), failure, memory: Arc::default(), profiler }))
+        let profiler = profiled.then(|| Profiler::new(&device));
+        Arc::new(Self { device, queue, adapter: adapter.get_info().into(), failure, memory: Arc::default(), profiler })
     }
 
     /// The largest storage buffer, bytes.
@@ -176,6 +231,9 @@ impl Gpu {
     }
 
     /// The first failure that the device reported since it was opened, if any.
+    ///
+    /// # Errors
+    /// That failure.
     pub fn check(&self) -> Result<(), GpuError> {
         match &*self.failure.lock().unwrap_or_else(PoisonError::into_inner) {
             None => Ok(()),
@@ -185,6 +243,9 @@ impl Gpu {
     }
 
     /// Waits until everything submitted is done.
+    ///
+    /// # Errors
+    /// [`GpuError`] if the device failed.
     pub fn wait(&self) -> Result<(), GpuError> {
         self.device.poll(wgpu::PollType::wait_indefinitely()).map_err(|e| GpuError::Failed(e.to_string()))?;
         self.check()
@@ -199,6 +260,23 @@ impl Gpu {
     pub fn peak_bytes(&self) -> u64 {
         self.memory.peak.load(Ordering::Relaxed)
     }
+}
+
+/// Checks what the shaders use of a device's limits against WebGPU's defaults, which they stay within.
+fn check_limits(offered: &wgpu::Limits) -> Result<(), GpuError> {
+    let needed = wgpu::Limits::default();
+    let check = |limit, of: fn(&wgpu::Limits) -> u64| {
+        let (needed, offered) = (of(&needed), of(offered));
+        if offered >= needed { Ok(()) } else { Err(GpuError::MissingLimit { limit, needed, offered }) }
+    };
+    check("max_bindings_per_bind_group", |l| l.max_bindings_per_bind_group.into())?;
+    check("max_storage_buffers_per_shader_stage", |l| l.max_storage_buffers_per_shader_stage.into())?;
+    check("max_uniform_buffers_per_shader_stage", |l| l.max_uniform_buffers_per_shader_stage.into())?;
+    check("max_uniform_buffer_binding_size", |l| l.max_uniform_buffer_binding_size)?;
+    check("max_compute_workgroup_storage_size", |l| l.max_compute_workgroup_storage_size.into())?;
+    check("max_compute_invocations_per_workgroup", |l| l.max_compute_invocations_per_workgroup.into())?;
+    check("max_compute_workgroup_size_x", |l| l.max_compute_workgroup_size_x.into())?;
+    check("max_compute_workgroups_per_dimension", |l| l.max_compute_workgroups_per_dimension.into())
 }
 
 fn watch(device: &wgpu::Device, failure: &Arc<Mutex<Option<Failure>>>) {

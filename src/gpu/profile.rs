@@ -37,6 +37,9 @@ impl Gpu {
 
     /// Waits and returns `(label, milliseconds)` of everything marked since the last call, in order; `None` where the adapter or the
     /// way it was opened gives no timestamps. The last mark ends the one before it and has no time of its own.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn take_profile(&self) -> Result<Option<Vec<(&'static str, f64)>>, GpuError> {
         let Some(profiler) = &self.profiler else { return Ok(None) };
         let marks = std::mem::take(&mut *profiler.marks.lock().unwrap_or_else(PoisonError::into_inner));

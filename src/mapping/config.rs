@@ -1,4 +1,4 @@
-//! What the mapper can be told.
+//! Mapper configuration.
 
 use serde::{Deserialize, Serialize};
 
@@ -21,18 +21,31 @@ pub struct MappingConfig {
     pub yields_to_keyframes: bool,
     /// Seed of the draws among keyframes.
     pub seed: u64,
+    /// Keyframes that a step may draw.
     pub window: WindowConfig,
+    /// Views, sizes and number of the steps after a keyframe.
     pub schedule: ScheduleConfig,
+    /// Tiles of a view that a step uses.
     pub tile_sampling: TileSamplingConfig,
+    /// Bounds on Gaussians, memory and keyframes.
     pub limits: LimitsConfig,
+    /// Refinement of keyframe poses by the images.
     pub refine_poses: RefinePosesConfig,
+    /// Correction of exposure and white balance.
     pub exposure: ExposureConfig,
+    /// Insertion of Gaussians at a keyframe.
     pub insertion: InsertionConfig,
+    /// Depth estimation for cameras without a depth sensor.
     pub plane_sweep: PlaneSweepConfig,
+    /// Gaussians from the recording's points.
     pub points: PointsConfig,
+    /// Refinement over all keyframes after the last one.
     pub refine: RefineConfig,
+    /// Densification and pruning.
     pub density: DensityConfig,
+    /// Image loss.
     pub loss: LossConfig,
+    /// Learning rates and decay rates.
     pub adam: AdamConfig,
 }
 
@@ -132,6 +145,7 @@ impl Default for TileSamplingConfig {
 pub struct InsertionConfig {
     /// One Gaussian per `stride`² pixels where the image has most detail, and per `flat_stride`² where it is flat.
     pub stride: u32,
+    /// Side of the largest blocks, pixels.
     pub flat_stride: u32,
     /// Standard deviation of a block's colours (0 to 1) above which the block is quartered.
     pub detail: f32,
@@ -150,6 +164,7 @@ pub struct InsertionConfig {
     pub opacity: f32,
     /// No Gaussian is inserted nearer to the camera or farther than this, metres.
     pub min_depth_metres: f32,
+    /// Largest distance of an inserted Gaussian, metres.
     pub max_depth_metres: f32,
 }
 
@@ -179,6 +194,7 @@ pub struct PointsConfig {
     pub spacing_pixels: f32,
     /// Standard deviation in units of the mean distance to the three nearest points.
     pub footprint: f32,
+    /// Initial opacity, 0 to 1.
     pub opacity: f32,
     /// No Gaussian is this many times smaller or larger than the median one.
     pub size_range: f32,
@@ -206,6 +222,7 @@ pub struct RefineConfig {
     pub half_size_share: f32,
     /// What the rates of positions, and all others, fall to in the end, as a share of what they are at first.
     pub final_lr_scale_position: f32,
+    /// Factor on all other learning rates at the end of the refinement.
     pub final_lr_scale: f32,
 }
 
@@ -256,6 +273,9 @@ impl MappingConfig {
     }
 
     /// Says what is wrong with the values, if anything.
+    ///
+    /// # Errors
+    /// A description of the first invalid value.
     pub fn validate(&self) -> Result<(), String> {
         let s = &self.insertion;
         if !(s.stride.is_power_of_two() && s.flat_stride.is_power_of_two() && s.stride <= s.flat_stride && s.flat_stride <= 64) {

@@ -32,6 +32,9 @@ impl Default for ExposureConfig {
 
 impl ExposureConfig {
     /// Says what is wrong with the values, if anything.
+    ///
+    /// # Errors
+    /// A description of the first invalid value.
     pub fn validate(&self) -> Result<(), String> {
         let positive = |v: f32| v.is_finite() && v > 0.0;
         if !(positive(self.prior_share) && positive(self.max_change)) {

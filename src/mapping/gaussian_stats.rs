@@ -9,6 +9,7 @@ use serde::{Deserialize, Serialize};
 use super::KeyframeId;
 use crate::geometry::Se3;
 use crate::optimise::GaussianScore;
+use crate::render::Plan;
 
 /// A keyframe that moves by less than both was only refined, and optimisation takes its Gaussians along; a loop moves it further.
 const MIN_SHIFT_METRES: f64 = 0.01;
@@ -41,12 +42,12 @@ impl GaussianStats {
         self.histories.extend(std::iter::repeat_n(GaussianHistory { anchor: keyframe, ..GaussianHistory::default() }, count));
     }
 
-    /// Only the Gaussians at `keep` are left, and those of `parents` each have a child at the end.
-    pub fn apply(&mut self, keep: &[u32], parents: impl Iterator<Item = u32>) {
+    /// Follows a plan: children inherit the keyframe of their parent, and nothing else.
+    pub fn apply(&mut self, plan: &Plan) {
         let child =
             |parent: u32| GaussianHistory { anchor: self.histories[parent as usize].anchor, ..GaussianHistory::default() };
-        let kept = keep.iter().map(|i| self.histories[*i as usize]);
-        self.histories = kept.chain(parents.map(child)).collect();
+        let kept = plan.keep.iter().map(|i| self.histories[*i as usize]);
+        self.histories = kept.chain(plan.parents().map(child)).collect();
     }
 
     /// Another keyframe was mapped.
@@ -91,13 +92,16 @@ pub(super) fn motion(old_world_from_camera: &Se3, new_world_from_camera: &Se3) -
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::render::Child;
+    use glam::Vec3;
     use nalgebra::{Point3, Vector3};
 
     #[test]
     fn runs_follow_appending_pruning_and_growing() {
         let mut stats = GaussianStats::default();
         [(0, 4), (2, 3), (5, 2)].into_iter().for_each(|(keyframe, count)| stats.append(keyframe, count));
-        stats.apply(&[0, 3, 4, 6, 8], [1, 5, 5].into_iter());
+        let child = |parent| Child { parent, mean: Vec3::ZERO, raw_opacity: 0.0, log_scale: Vec3::ZERO };
+        stats.apply(&Plan { keep: vec![0, 3, 4, 6, 8], children: [1, 5, 5].map(child).to_vec() });
         let shift = Se3::translation(1.0, 0.0, 0.0);
         let motions = BTreeMap::from([(2, shift), (5, shift), (7, shift)]);
         assert_eq!(stats.moved(&motions), [(2..4, shift), (4..5, shift), (6..8, shift)]);

@@ -18,9 +18,13 @@ use crate::splat::{Exposure, ViewCamera};
 /// What arrives.
 #[derive(Clone, Debug)]
 pub struct Keyframe {
+    /// Identity, ascending in the order of tracking.
     pub id: KeyframeId,
+    /// Pose at the time of sending.
     pub world_from_camera: Se3,
+    /// Rectified colour and depth at the mapping resolution.
     pub image: RectifiedImage,
+    /// Origin of the depth in `image`.
     pub depth_source: DepthSource,
     /// Earlier keyframes that see the same landmarks, strongest first.
     pub covisible: Vec<KeyframeId>,
@@ -45,6 +49,7 @@ pub enum DepthSource {
 /// The other image of a stereo pair, at the mapping resolution.
 #[derive(Clone, Debug)]
 pub struct RightImage {
+    /// Brightness, of the size of the left image.
     pub gray: GrayImage,
     /// From the left camera along its x axis.
     pub baseline_metres: f64,
@@ -53,6 +58,7 @@ pub struct RightImage {
 /// What is kept: the image only where the optimiser needs it.
 #[derive(Debug)]
 pub(super) struct MappedKeyframe {
+    /// Identity, ascending in the order of tracking.
     pub id: KeyframeId,
     /// At the refined pose.
     pub camera: ViewCamera,
@@ -83,6 +89,7 @@ struct Images {
 /// All of a keyframe but its image, which the recording has.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub(super) struct KeyframeState {
+    /// Identity, ascending in the order of tracking.
     pub id: KeyframeId,
     camera: ViewCamera,
     tracked_from_world: Se3,

@@ -64,6 +64,9 @@ impl LimitsConfig {
     }
 
     /// Says what is wrong with the values, if anything.
+    ///
+    /// # Errors
+    /// A description of the first invalid value.
     pub fn validate(&self) -> Result<(), String> {
         if self.max_gaussians.is_some_and(|n| n < LEAST_GAUSSIANS) {
             return Err(format!("max_gaussians must be at least {LEAST_GAUSSIANS}"));

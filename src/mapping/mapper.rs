@@ -1,6 +1,8 @@
 //! The mapper: owns the Gaussians, their moments and the keyframe window.
 
+mod control;
 mod refine;
+mod relative_poses;
 mod state;
 
 use std::borrow::Cow;
@@ -9,27 +11,22 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use fastrand::Rng;
-use glam::{Quat, Vec3};
 use image::RgbImage;
 use serde::{Deserialize, Serialize};
 
 pub use refine::{FinalRefinement, RefineReport};
 pub use state::MapperState;
 
-use super::density::{self, Candidate};
 use super::gaussian_stats::{self, GaussianStats};
 use super::keyframe::{DepthSource, MappedKeyframe};
 use super::plane_sweep::{self, SourceView};
 use super::refine_poses::RefinedPair;
 use super::schedule::{self, Session, Step};
-use super::{
-    DensityStrategy, Keyframe, KeyframeId, LimitsConfig, MappingConfig, RefinePosesConfig, exposure, initialise_from_points,
-    insertion, limits,
-};
+use super::{Keyframe, KeyframeId, LimitsConfig, MappingConfig, exposure, initialise_from_points, insertion, limits};
 use crate::geometry::Se3;
 use crate::gpu::{Gpu, GpuError};
-use crate::optimise::{GaussianScore, StepReport, Trainer, TrainingView, WrongPixels};
-use crate::render::{GpuCloud, Rendered};
+use crate::optimise::{AdamConfig, StepReport, Trainer, TrainingView, WrongPixels};
+use crate::render::{GpuCloud, Plan, Rendered};
 use crate::sequence::{KnownPoint, RectifiedImage};
 use crate::splat::{Exposure, GaussianCloud, ViewCamera};
 
@@ -40,6 +37,7 @@ const BATCH: usize = 10;
 /// Fewer where others wait for the machine.
 const YIELDING_BATCH: usize = 3;
 
+/// Failure of the mapper.
 #[derive(Debug, thiserror::Error)]
 pub enum MappingError {
     #[error(transparent)]
@@ -57,13 +55,17 @@ pub enum MappingError {
 /// What happened to a keyframe.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct KeyframeReport {
+    /// The keyframe.
     pub id: KeyframeId,
     /// Gaussians inserted.
     pub inserted: usize,
+    /// Gaussians removed.
     pub pruned: usize,
     /// Gaussians that came by dividing others.
     pub grown: usize,
+    /// Gaussians in the map afterwards.
     pub gaussians: usize,
+    /// Optimisation steps taken.
     pub iterations: usize,
     /// Mean PSNR of the steps' views before each step.
     pub psnr_db: f32,
@@ -75,7 +77,8 @@ pub struct KeyframeReport {
 /// Seeds, optimises and prunes the map.
 #[derive(Debug)]
 pub struct Mapper {
-    config: MappingConfig,
+    /// As resolved; no phase changes it.
+    config: Arc<MappingConfig>,
     gpu: Arc<Gpu>,
     trainer: Trainer,
     cloud: GpuCloud,
@@ -86,9 +89,13 @@ pub struct Mapper {
 }
 
 impl Mapper {
+    /// An empty map on `gpu`.
+    ///
+    /// # Errors
+    /// [`MappingError`] if a buffer does not fit or the device fails.
     pub fn new(gpu: Arc<Gpu>, config: &MappingConfig) -> Result<Self, MappingError> {
         Ok(Self {
-            config: config.clone(),
+            config: Arc::new(config.clone()),
             trainer: Trainer::new(gpu.clone())?,
             cloud: GpuCloud::new(&gpu, config.sh_degree, FIRST_CAPACITY)?,
             stats: GaussianStats::default(),
@@ -101,6 +108,9 @@ impl Mapper {
 
     /// Takes in a keyframe: inserts what the map lacks, optimises over the window, prunes. `stop` is asked between the steps. A keyframe without
     /// depth is passed over until there is a map.
+    ///
+    /// # Errors
+    /// [`MappingError`] if a buffer does not fit or the device fails.
     pub fn insert(&mut self, keyframe: &Keyframe, stop: &dyn Fn() -> bool) -> Result<KeyframeReport, MappingError> {
         if keyframe.image.depth.is_none() && self.has_not_begun() {
             return Ok(KeyframeReport { id: keyframe.id, ..KeyframeReport::default() });
@@ -132,6 +142,9 @@ impl Mapper {
     }
 
     /// Takes in points of the scene that are known before any keyframe, in the keyframes' world; `anchor` is the first of these.
+    ///
+    /// # Errors
+    /// [`MappingError`] if a buffer does not fit or the device fails.
     pub fn add_points(&mut self, known: &[KnownPoint], anchor: KeyframeId) -> Result<(), MappingError> {
         let new = initialise_from_points::gaussians(known, &self.config.points, self.config.sh_degree);
         let left_out = self.cloud.append(&self.gpu, &new)?;
@@ -141,6 +154,9 @@ impl Mapper {
 
     /// Moves earlier keyframes to better poses, and with those that move far the Gaussians inserted from them; returns how many. Unknown
     /// ids are those that were never sent to the mapper.
+    ///
+    /// # Errors
+    /// [`MappingError`] if a buffer does not fit or the device fails.
     pub fn update_poses(&mut self, updates: &[(KeyframeId, Se3)]) -> Result<usize, MappingError> {
         let mut motions = BTreeMap::new();
         let updates: BTreeMap<KeyframeId, &Se3> = updates.iter().map(|(id, pose)| (*id, pose)).collect();
@@ -163,15 +179,25 @@ impl Mapper {
         if !self.config.refine_poses.enabled || self.keyframes.is_empty() {
             return Vec::new();
         }
-        relative_poses(&self.keyframes, &schedule::window(&self.keyframes, &self.config.window), &self.config.refine_poses)
+        relative_poses::refined(
+            &self.keyframes,
+            &schedule::window(&self.keyframes, &self.config.window),
+            &self.config.refine_poses,
+        )
     }
 
-    /// The map as it is now.
+    /// Downloads the averaged parameters of all Gaussians. Blocks until the GPU is idle.
+    ///
+    /// # Errors
+    /// [`MappingError`] if a buffer does not fit or the device fails.
     pub fn download(&self) -> Result<GaussianCloud, MappingError> {
         Ok(self.cloud.download(&self.gpu)?)
     }
 
     /// Renders the map over black.
+    ///
+    /// # Errors
+    /// [`MappingError`] if a buffer does not fit or the device fails.
     pub fn render(&mut self, camera: &ViewCamera) -> Result<Rendered, MappingError> {
         Ok(self.trainer.render(&self.cloud, camera, [0.0; 3])?)
     }
@@ -181,11 +207,17 @@ impl Mapper {
         &self.step_times
     }
 
+    /// Whether any step has moved the map: before, its colours are those of single pixels.
+    fn is_trained(&self) -> bool {
+        !self.step_times.is_empty()
+    }
+
     /// Whether it has passed over all keyframes so far.
     pub fn has_not_begun(&self) -> bool {
         self.keyframes.is_empty() && self.cloud.is_empty()
     }
 
+    /// Number of Gaussians in the map.
     pub fn gaussians(&self) -> usize {
         self.cloud.len()
     }
@@ -219,7 +251,7 @@ impl Mapper {
     /// The exposure of an image of which the map shows `rendered`. A map that no step has moved yet shows nothing that counts.
     fn exposure(&self, image: &RgbImage, rendered: Option<&Rendered>) -> Exposure {
         let (config, last) = (&self.config.exposure, self.keyframes.last().map_or(Exposure::default(), |k| k.exposure));
-        let shown = rendered.filter(|_| config.enabled && !self.step_times.is_empty());
+        let shown = rendered.filter(|_| config.enabled && self.is_trained());
         shown.map_or(last, |rendered| exposure::measure(image, rendered, &last, config))
     }
 
@@ -233,8 +265,9 @@ impl Mapper {
             self.cloud.limit(most);
             new = new.thinned(limits::insertions_allowed(new.len(), most));
             let keep = limits::most_useful(self.stats.histories(), most - new.len());
-            self.cloud.change(&self.gpu, &keep, (&[], &[]))?;
-            self.stats.apply(&keep, std::iter::empty());
+            let plan = Plan::keeping(keep);
+            self.cloud.apply(&self.gpu, &plan)?;
+            self.stats.apply(&plan);
         }
         let left_out = self.cloud.append(&self.gpu, &new)?;
         self.stats.append(keyframe.id, new.len() - left_out);
@@ -260,41 +293,6 @@ impl Mapper {
         }
     }
 
-    /// Whether, and by what, Gaussians are scored: for control of their density, or to know which to give up.
-    fn scoring(&self) -> Option<WrongPixels> {
-        let wanted = self.config.density.strategy != DensityStrategy::None || self.config.limits.limits_gaussians();
-        wanted.then(|| self.config.density.wrong_pixels())
-    }
-
-    /// Removes and divides Gaussians by the scores of the steps just taken; returns how many fewer and how many more there are for it.
-    fn control_density(&mut self) -> Result<(usize, usize), MappingError> {
-        if self.cloud.is_empty() {
-            return Ok((0, 0));
-        }
-        let scores = match self.scoring() {
-            Some(_) => self.trainer.read_scores(&self.cloud)?,
-            None => vec![GaussianScore::default(); self.cloud.len()],
-        };
-        self.stats.scored(&scores);
-        let [geometry, scales, rotations] = [0, 1, 2].map(|plane| self.cloud.read_plane(&self.gpu, plane));
-        let (geometry, scales, rotations) = (geometry?, scales?, rotations?);
-        let candidate = |i: usize| {
-            let ([x, y, z, raw_opacity], [a, b, c, _], [qw, qx, qy, qz]) = (geometry[i], scales[i], rotations[i]);
-            let (mean, log_scale, rotation) = (Vec3::new(x, y, z), Vec3::new(a, b, c), Quat::from_xyzw(qx, qy, qz, qw));
-            Candidate { mean, raw_opacity, log_scale, rotation, score: scores[i], history: self.stats.histories()[i] }
-        };
-        let candidates: Vec<Candidate> = (0..self.cloud.len()).map(candidate).collect();
-        let plan = density::plan(&candidates, self.most_gaussians(), &self.config.density);
-        let (before, children) = (self.cloud.len(), plan.children.len());
-        let geometry = |c: &density::Child| [c.mean.extend(c.raw_opacity).into(), c.log_scale.extend(0.0).into()];
-        let parents: Vec<u32> = plan.children.iter().map(|c| c.parent).collect();
-        let geometry: Vec<[[f32; 4]; 2]> = plan.children.iter().map(geometry).collect();
-        self.cloud.change(&self.gpu, &plan.keep, (&parents, &geometry))?;
-        self.stats.apply(&plan.keep, parents.into_iter());
-        // Two children take their parent's place.
-        Ok((before - plan.keep.len() - children / 2, children / 2))
-    }
-
     /// Steps over the window until all are taken or nothing more is gained; on the way some of them score the Gaussians, whose density is
     /// then controlled. Reports what it did.
     fn optimise(&mut self, iterations: usize, stop: &dyn Fn() -> bool) -> Result<KeyframeReport, MappingError> {
@@ -302,16 +300,18 @@ impl Mapper {
             return Ok(KeyframeReport::default());
         }
         let window = schedule::window(&self.keyframes, &self.config.window);
-        let density = &self.config.density;
+        let config = self.config.clone();
+        let density = &config.density;
         let controlled = self.keyframes.len().is_multiple_of(density.every);
         // The scored steps are among the steps.
-        let scored = self.scoring().filter(|_| controlled).map_or(0, |_| density.views.min(window.len()).min(iterations));
+        let scored = self.scoring(density).filter(|_| controlled).map_or(0, |_| density.views.min(window.len()).min(iterations));
         let unscored = iterations - scored;
         let mut session = Session::new(window.clone(), unscored);
         let due = (density.after_share * unscored as f32).round() as usize;
         let before = self.steps_of(&mut session, due, stop)?;
         self.stats.keyframe_mapped();
-        let (scored, (pruned, grown)) = if controlled { (self.score(&window)?, self.control_density()?) } else { (0, (0, 0)) };
+        let (scored, (pruned, grown)) =
+            if controlled { (self.score(&window, density, &config.adam)?, self.control_density(density)?) } else { (0, (0, 0)) };
         let after = self.steps_of(&mut session, unscored, stop)?;
         let done = before.0 + after.0;
         let psnr_db = (before.1 + after.1) / done.max(1) as f32;
@@ -325,7 +325,8 @@ impl Mapper {
         while !session.is_over(end) && !stop() {
             let count = most.min(end - session.taken());
             let batch = session.next(count, &self.keyframes, &mut self.rng, &self.config.window, &self.config.schedule);
-            let reports = self.steps(&batch, None)?;
+            let adam = &self.config.clone().adam;
+            let reports = self.steps(&batch, None, adam)?;
             self.refine_poses(session.window(), &batch, &reports);
             psnr_sum += reports.iter().map(|r| r.loss.psnr_db()).sum::<f32>();
             done += batch.len();
@@ -344,22 +345,7 @@ impl Mapper {
         }
     }
 
-    /// A last step of each of some keyframes of the window, evenly spread over it, that scores the Gaussians; returns their number.
-    fn score(&mut self, window: &[usize]) -> Result<usize, MappingError> {
-        let Some(wrong) = self.scoring() else { return Ok(0) };
-        self.trainer.begin_scores(&self.cloud)?;
-        let views = self.config.density.views.min(window.len());
-        let chosen: Vec<Step> = (0..views)
-            .map(|k| Step {
-                keyframe: window[k * window.len() / views],
-                coarse: false,
-                lr_scale: self.config.window.final_lr_scale,
-            })
-            .collect();
-        Ok(self.steps(&chosen, Some(wrong))?.len())
-    }
-
-    fn steps(&mut self, batch: &[Step], scored: Option<WrongPixels>) -> Result<Vec<StepReport>, MappingError> {
+    fn steps(&mut self, batch: &[Step], scored: Option<WrongPixels>, adam: &AdamConfig) -> Result<Vec<StepReport>, MappingError> {
         // A pose is refined by its whole image.
         let tile_sampling = self.config.tile_sampling.sampling().filter(|_| !self.config.refine_poses.enabled);
         let view = |step: &Step| {
@@ -370,7 +356,7 @@ impl Mapper {
         };
         let views: Vec<TrainingView<'_>> = batch.iter().map(view).collect();
         let started = Instant::now();
-        let reports = self.trainer.steps(&self.cloud, &views, &self.config.loss, &self.config.adam)?;
+        let reports = self.trainer.steps(&self.cloud, &views, &self.config.loss, adam)?;
         self.step_times.extend(std::iter::repeat_n(started.elapsed() / batch.len().max(1) as u32, batch.len()));
         for (step, report) in batch.iter().zip(&reports) {
             let keyframe = &mut self.keyframes[step.keyframe];
@@ -381,26 +367,4 @@ impl Mapper {
         }
         Ok(reports)
     }
-}
-
-/// The window's keyframes, each relative to the one of the window with which it shares most, where both have been refined.
-fn relative_poses(keyframes: &[MappedKeyframe], window: &[usize], config: &RefinePosesConfig) -> Vec<RefinedPair> {
-    // The first keyframe is the world, and right by definition.
-    let refined = |k: usize| k == 0 || keyframes[k].refinement.is_informative();
-    let partner = |k: usize| {
-        let of_window = |id: &KeyframeId| window.iter().copied().find(|w| keyframes[*w].id == *id);
-        keyframes[k].covisible.iter().filter_map(of_window).find(|w| refined(*w))
-    };
-    let pair = |(k, other): (usize, usize)| {
-        let (keyframe, relative) = (&keyframes[k], &keyframes[other]);
-        let sigma_rotation_rad = config.sigma_pixels / keyframe.camera.pinhole.fx;
-        RefinedPair {
-            keyframe: keyframe.id,
-            relative_to: relative.id,
-            keyframe_from_relative: keyframe.camera.camera_from_world * relative.camera.camera_from_world.inverse(),
-            sigma_translation_metres: sigma_rotation_rad * keyframe.depth_metres,
-            sigma_rotation_rad,
-        }
-    };
-    window.iter().filter(|k| refined(**k)).filter_map(|k| Some((*k, partner(*k)?))).map(pair).collect()
 }

@@ -18,6 +18,7 @@ use crate::splat::ViewCamera;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct PlaneSweepConfig {
+    /// Whether depth is estimated at all.
     pub enabled: bool,
     /// Depths that are tried at each pixel.
     pub planes: usize,

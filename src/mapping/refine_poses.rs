@@ -26,16 +26,19 @@ const MIN_STEPS: i32 = 8;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RefinePosesConfig {
+    /// Whether poses are refined at all.
     pub enabled: bool,
     /// Whether the tracker is told the refined poses, as measurements of relative poses.
     pub tell_tracker: bool,
     /// Most that a step turns or shifts a keyframe: radians, metres.
     pub lr_rotation: f64,
+    /// Most that a step shifts a keyframe, metres.
     pub lr_translation: f64,
     /// Share of the way back to the tracker's pose that each step begins with: keeps the window from drifting off as a whole.
     pub pull: f64,
     /// A step that would lead further than this from the tracker's pose is not taken: radians, metres.
     pub max_turn_rad: f64,
+    /// Largest distance from the tracker's pose, metres.
     pub max_shift_metres: f64,
     /// Standard deviation of a refined relative pose, in pixels of the mapped image at the keyframe's median depth. On a synthetic room
     /// the refined poses are truer than that, by 0.07 pixels, but most of this is the tracker's own say coming back: at 0.1 it holds the
@@ -134,11 +137,15 @@ impl PoseRefinement {
 /// What the images say of two keyframes, in the terms of the tracker.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RefinedPair {
+    /// The keyframe that is measured.
     pub keyframe: KeyframeId,
+    /// The keyframe that it is measured against.
     pub relative_to: KeyframeId,
+    /// Relative pose of the two cameras.
     pub keyframe_from_relative: Se3,
     /// Standard deviations of each coordinate of the translation, in the keyframe's frame, and of the rotation about each axis.
     pub sigma_translation_metres: f64,
+    /// Standard deviation of the rotation about each axis, radians.
     pub sigma_rotation_rad: f64,
 }
 

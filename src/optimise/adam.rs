@@ -27,7 +27,9 @@ pub struct AdamConfig {
     pub harmonics_every: usize,
     /// Decay of the first and the second moments.
     pub beta_1: f32,
+    /// Decay of the second moment.
     pub beta_2: f32,
+    /// Added to the root of the second moment.
     pub epsilon: f32,
     /// How many times longer than its second axis a Gaussian's longest may become.
     pub max_elongation: f32,
@@ -62,6 +64,9 @@ impl Default for AdamConfig {
 
 impl AdamConfig {
     /// Says what is wrong with the values, if anything.
+    ///
+    /// # Errors
+    /// A description of the first invalid value.
     pub fn validate(&self) -> Result<(), String> {
         let rates = [self.lr_position, self.lr_opacity, self.lr_log_scale, self.lr_rotation, self.lr_color, self.lr_harmonics];
         if rates.iter().any(|rate| !(rate.is_finite() && *rate >= 0.0)) {

@@ -26,6 +26,9 @@ impl Default for LossConfig {
 
 impl LossConfig {
     /// Says what is wrong with the values, if anything.
+    ///
+    /// # Errors
+    /// A description of the first invalid value.
     pub fn validate(&self) -> Result<(), String> {
         if !(0.0..=1.0).contains(&self.ssim_weight) {
             return Err("ssim_weight must lie between 0 and 1".into());
@@ -42,6 +45,7 @@ impl LossConfig {
 pub struct LossTerms {
     /// Mean |colour error| and mean SSIM over pixels and channels.
     pub l1: f32,
+    /// Mean structural similarity, 1 for equal images.
     pub ssim: f32,
     /// Mean |Σ w z - α·sensor depth| over all pixels, each weighted by the sensor's precision, metres.
     pub depth_metres: f32,
@@ -65,6 +69,7 @@ impl LossTerms {
         (1.0 - config.ssim_weight) * self.l1 + config.ssim_weight * (1.0 - self.ssim) + config.depth_weight * self.depth_metres
     }
 
+    /// Peak signal-to-noise ratio of the colours, dB.
     pub fn psnr_db(&self) -> f32 {
         -10.0 * self.mse.max(1e-10).log10()
     }
@@ -73,7 +78,9 @@ impl LossTerms {
 /// A keyframe's image on the GPU: 8-bit colour and sensor depth.
 #[derive(Debug)]
 pub struct TargetImage {
+    /// Pixels along x.
     pub width: u32,
+    /// Pixels along y.
     pub height: u32,
     pub(super) color: GpuBuffer,
     pub(super) depth: GpuBuffer,
@@ -83,6 +90,9 @@ pub struct TargetImage {
 
 impl TargetImage {
     /// Uploads an image and, where the sensor has one, its depth `[H * W]` in metres; pixels at 0 do not enter the depth loss.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn new(gpu: &Gpu, image: &RgbImage, depth_metres: Option<&[f32]>) -> Result<Self, GpuError> {
         let target = Self::blank(gpu, image.dimensions())?;
         let packed: Vec<u32> = image.pixels().map(|p| u32::from_le_bytes([p.0[0], p.0[1], p.0[2], 255])).collect();
@@ -105,11 +115,17 @@ impl TargetImage {
     }
 
     /// Its depth, `[H, W]`, read back.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn depth_metres(&self, gpu: &Gpu) -> Result<Vec<f32>, GpuError> {
         self.depth.read(gpu, 0, (self.width * self.height) as usize)
     }
 
     /// The losses of its tiles when each was last worked on, read back.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn tile_losses(&self, gpu: &Gpu) -> Result<Vec<[f32; 4]>, GpuError> {
         self.tile_losses.read(gpu, 0, image_buffers::tiles((self.width, self.height)))
     }

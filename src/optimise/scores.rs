@@ -25,15 +25,25 @@ pub struct GaussianScore {
     pub weighted_wrong_pixels: f32,
     /// Sum and maximum of what it added to a pixel, 0 to 1.
     pub weight_sum: f32,
+    /// Maximum of the blending weights, 0 to 1.
     pub weight_max: f32,
     /// Sums over the views of the loss gradient by its image position, and of the sums of absolute gradients over its pixels;
     /// normalised device coordinates, as 3DGS has them.
     pub gradient: f32,
+    /// Sum of absolute image-position gradients, normalised device coordinates.
     pub absolute_gradient: f32,
     /// Views that blended it.
     pub views: f32,
     /// Size of a pixel at its depth in the view nearest to it, metres.
     pub metres_per_pixel: f32,
+}
+
+/// A rendered image with its loss.
+pub(super) struct ScoredImage<'a> {
+    /// `[2, H, W]` gradients of the loss by the image.
+    pub gradients: &'a GpuBuffer,
+    pub loss_total: &'a GpuBuffer,
+    pub loss: &'a LossConfig,
 }
 
 /// The scoring passes and their buffers.
@@ -88,12 +98,13 @@ impl Scores {
         pass: &mut wgpu::ComputePass<'_>,
         rasterizer: &Rasterizer,
         prepared: &PreparedView,
-        (image_gradients, loss_total): (&GpuBuffer, &GpuBuffer),
-        (wrong, loss): (&WrongPixels, &LossConfig),
+        image: &ScoredImage<'_>,
+        wrong: &WrongPixels,
     ) {
         let (gpu, ws) = (rasterizer.gpu(), &rasterizer.workspace);
         let pixels = prepared.view.pixels() as f32;
-        let setup = ScoreSetup { error_ratio: wrong.error_ratio, noise: wrong.noise, ssim_weight: loss.ssim_weight, pixels };
+        let setup =
+            ScoreSetup { error_ratio: wrong.error_ratio, noise: wrong.noise, ssim_weight: image.loss.ssim_weight, pixels };
         self.setup.write(gpu, 0, &[setup]);
         let rasterize = [
             (0, rasterizer.view()),
@@ -103,10 +114,10 @@ impl Scores {
             (4, &ws.projected),
             (5, &ws.color_depth),
             (6, &ws.state),
-            (7, image_gradients),
+            (7, image.gradients),
             (8, &ws.intersection_gradients),
             (9, &self.setup),
-            (10, loss_total),
+            (10, image.loss_total),
         ];
         self.rasterize.dispatch(gpu, pass, &rasterize, rasterizer.form().workgroups(prepared.view.tiles()));
         let gather = [
@@ -117,7 +128,7 @@ impl Scores {
             (4, &ws.projected),
             (5, &self.scores),
             (6, &self.setup),
-            (7, loss_total),
+            (7, image.loss_total),
         ];
         let visible = (&ws.counters, Counter::per_element_offset(VISIBLE_COUNTER));
         self.gather.dispatch_indirect(gpu, pass, &gather, visible);

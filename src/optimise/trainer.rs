@@ -1,5 +1,6 @@
 //! One training step on the GPU: forward, loss, backward, Adam; and the same without stepping, for whoever wants the gradients.
 
+mod encode;
 mod state;
 
 use std::sync::Arc;
@@ -9,20 +10,22 @@ pub use state::TrainerState;
 
 use bytemuck::{Pod, Zeroable};
 
-use super::image_buffers::{self, ImageBuffers, LOSS_TILE};
+use super::image_buffers::{self, ImageBuffers};
 use super::kernels::Kernels;
-use super::scores::{GaussianScore, Scores, WrongPixels};
+use super::scores::{GaussianScore, ScoredImage, Scores, WrongPixels};
 use super::tile_sampling::{TileSampler, TileSampling};
 use super::{AdamConfig, LossConfig, LossTerms, TargetImage};
 use crate::gpu::{Gpu, GpuBuffer, GpuError};
-use crate::render::layout::{AdamSetup, COUNTERS, Counter, LossSetup, VISIBLE_COUNTER, View};
-use crate::render::{BlendForm, GpuCloud, PreparedView, Rasterizer, Rendered, ViewCounts, cloud_from_planes};
+use crate::render::layout::{AdamSetup, COUNTERS, Counter, LossSetup, View};
+use crate::render::{BlendForm, GpuCloud, Rasterizer, Rendered, ViewCounts, cloud_from_planes};
 use crate::splat::{GaussianCloud, ViewCamera};
 
 /// What a step did.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct StepReport {
+    /// Terms of the image loss.
     pub loss: LossTerms,
+    /// Work of the view.
     pub counts: ViewCounts,
     /// Gradient of the loss by the pose before the step, as in [`Gradients`].
     pub pose: [f32; 6],
@@ -31,7 +34,9 @@ pub struct StepReport {
 /// A view to learn from.
 #[derive(Clone, Copy, Debug)]
 pub struct TrainingView<'a> {
+    /// Pose and intrinsics.
     pub camera: ViewCamera,
+    /// Recorded image and depth.
     pub target: &'a TargetImage,
     /// Whether the step also scores the Gaussians (see [`Trainer::begin_scores`]).
     pub scored: Option<WrongPixels>,
@@ -62,6 +67,7 @@ struct StepLog {
 /// Gradient of a loss by the map and by the pose.
 #[derive(Clone, Debug)]
 pub struct Gradients {
+    /// Terms of the image loss.
     pub loss: LossTerms,
     /// By the raw parameters of each Gaussian, in the shape of the map.
     pub cloud: GaussianCloud,
@@ -160,6 +166,9 @@ impl Trainer {
     /// For each view in turn: renders the map, compares it with the target, and moves the Gaussians that were blended by one step of
     /// Adam. The steps are submitted without waiting in between; what they report is read at the end. A step whose intersections did not
     /// fit moved nothing and is repeated after the others, with larger buffers.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn steps(
         &mut self,
         cloud: &GpuCloud,
@@ -224,11 +233,17 @@ impl Trainer {
     }
 
     /// Forgets all scores: from here on, steps of scored views add to those of `cloud`, which must not grow or shrink meanwhile.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn begin_scores(&mut self, cloud: &GpuCloud) -> Result<(), GpuError> {
         self.scores.clear(self.rasterizer.gpu(), cloud)
     }
 
     /// The scores since [`Self::begin_scores`], `[N]` in map order.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn read_scores(&self, cloud: &GpuCloud) -> Result<Vec<GaussianScore>, GpuError> {
         self.scores.read(self.rasterizer.gpu(), cloud)
     }
@@ -238,17 +253,10 @@ impl Trainer {
         self.encode_time
     }
 
-    fn encode_log(&self, encoder: &mut wgpu::CommandEncoder, log: &GpuBuffer, entry: usize) {
-        let to = (entry * std::mem::size_of::<StepLog>()) as u64;
-        let counters = &self.rasterizer.workspace.counters;
-        let [pose_at, counters_at] =
-            [std::mem::offset_of!(StepLog, pose), std::mem::offset_of!(StepLog, counters)].map(|at| at as u64);
-        encoder.copy_buffer_to_buffer(self.loss_total.raw(), 0, log.raw(), to, pose_at);
-        encoder.copy_buffer_to_buffer(self.pose_gradient.raw(), 0, log.raw(), to + pose_at, counters_at - pose_at);
-        encoder.copy_buffer_to_buffer(counters.raw(), 0, log.raw(), to + counters_at, counters.raw().size());
-    }
-
     /// The same, but returns the gradients and moves nothing.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn gradients(
         &mut self,
         cloud: &GpuCloud,
@@ -264,6 +272,9 @@ impl Trainer {
     }
 
     /// Gradients of any loss by the map and the pose, from its gradients by the image; moves nothing.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn gradients_from_image(
         &mut self,
         cloud: &GpuCloud,
@@ -343,9 +354,9 @@ impl Trainer {
         self.rasterizer.encode_forward(&mut pass, cloud.parameters(), &prepared);
         if let Objective::Image { loss, scored, tile_sampling, .. } = objective {
             tile_sampling.iter().for_each(|_| self.sampler.encode_fill(&mut pass, &self.rasterizer, &self.images[0]));
-            self.encode_loss(&mut pass, *loss);
-            let image = (&self.images[0].gradients, &self.loss_total);
-            scored.iter().for_each(|wrong| self.scores.encode(&mut pass, &self.rasterizer, &prepared, image, (wrong, loss.0)));
+            self.encode_loss(&mut pass, loss.0, loss.1);
+            let image = ScoredImage { gradients: &self.images[0].gradients, loss_total: &self.loss_total, loss: loss.0 };
+            scored.iter().for_each(|wrong| self.scores.encode(&mut pass, &self.rasterizer, &prepared, &image, wrong));
         }
         self.encode_backward(&mut pass, cloud, &prepared, sink);
         gpu.mark(&mut pass, Self::END_MARK);
@@ -354,61 +365,6 @@ impl Trainer {
             copy(encoder, &self.images[0].loss_sums, &target.tile_losses);
         }
         Ok(())
-    }
-
-    fn encode_loss(&self, pass: &mut wgpu::ComputePass<'_>, (loss, depth_confidence): (&LossConfig, f32)) {
-        let (gpu, ws, k) = (self.rasterizer.gpu(), &self.rasterizer.workspace, &self.kernels);
-        let TargetImage { width, height, color, depth, .. } = &self.images[0].target;
-        let (width, height) = (*width, *height);
-        let LossConfig { ssim_weight, depth_weight, precise_depth_metres: precise_depth } = *loss;
-        let setup = LossSetup { width, height, ssim_weight, depth_weight, precise_depth, depth_confidence };
-        self.loss_setup.write(gpu, 0, &[setup]);
-        let forward = [width.div_ceil(LOSS_TILE), height.div_ceil(LOSS_TILE / 2), 1];
-        let backward = [width.div_ceil(LOSS_TILE), height.div_ceil(LOSS_TILE), 1];
-        let inputs =
-            [(0, &self.loss_setup), (1, &ws.color_depth), (2, &ws.state), (3, color), (4, depth), (5, &self.images[0].partials)];
-        let with = |last| inputs.iter().copied().chain([last, (7, &ws.unsampled)]).collect::<Vec<_>>();
-        k.loss_forward.dispatch(gpu, pass, &with((6, &self.images[0].loss_sums)), forward);
-        k.loss_reduce.dispatch(gpu, pass, &[(0, &self.images[0].loss_sums), (1, &self.loss_total)], [1, 1, 1]);
-        k.loss_backward.dispatch(gpu, pass, &with((6, &self.images[0].gradients)), backward);
-    }
-
-    fn encode_backward(&self, pass: &mut wgpu::ComputePass<'_>, cloud: &GpuCloud, prepared: &PreparedView, sink: &Sink<'_>) {
-        let (gpu, ws, k) = (self.rasterizer.gpu(), &self.rasterizer.workspace, &self.kernels);
-        let blend = [
-            (0, self.rasterizer.view()),
-            (1, &ws.ranges),
-            (2, &ws.slots[prepared.sorted]),
-            (3, &ws.slot_gaussians),
-            (4, &ws.projected),
-            (5, &ws.color_depth),
-            (6, &ws.state),
-            (7, &self.images[0].gradients),
-            (8, &ws.intersection_gradients),
-        ];
-        k.rasterize_backward.dispatch(gpu, pass, &blend, self.rasterizer.form().workgroups(prepared.view.tiles()));
-        let mut project = vec![
-            (0, self.rasterizer.view()),
-            (1, &ws.counters),
-            (2, &ws.intersection_counts),
-            (3, &ws.intersection_gradients),
-            (4, &self.pose_sums),
-            (5, cloud.parameters()),
-        ];
-        let arguments = (&ws.counters, Counter::per_element_offset(VISIBLE_COUNTER));
-        let kernel = match sink {
-            Sink::Adam => {
-                project.extend([(6, cloud.moments_1()), (7, cloud.moments_2()), (8, &self.adam), (9, cloud.averages())]);
-                &k.project_backward_adam
-            }
-            Sink::Gradient(buffer) => {
-                project.push((6, *buffer));
-                &k.project_backward
-            }
-        };
-        kernel.dispatch_indirect(gpu, pass, &project, arguments);
-        let reduce = [(0, &ws.counters), (1, &self.pose_sums), (2, &self.pose_gradient)];
-        k.pose_reduce.dispatch(gpu, pass, &reduce, [1, 1, 1]);
     }
 
     fn read_loss(&self, gpu: &Gpu, target: &TargetImage) -> Result<LossTerms, GpuError> {

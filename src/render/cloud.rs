@@ -7,6 +7,7 @@ use nalgebra::Point3;
 use serde::{Deserialize, Serialize};
 
 use super::layout::{BlendForm, GEOMETRY_PLANES, GatherSetup};
+use super::plan::{GaussianGeometry, Plan};
 use super::shaders;
 use crate::geometry::Se3;
 use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, plain, workgroups};
@@ -46,6 +47,9 @@ pub struct CloudState {
 
 impl GpuCloud {
     /// An empty map with room for `capacity` Gaussians; it grows as needed.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn new(gpu: &Gpu, sh_degree: ShDegree, capacity: usize) -> Result<Self, GpuError> {
         let capacity = capacity.max(256);
         let planes = || allocate(gpu, sh_degree, capacity);
@@ -63,18 +67,22 @@ impl GpuCloud {
         })
     }
 
+    /// Number of Gaussians.
     pub fn len(&self) -> usize {
         self.count
     }
 
+    /// Whether there are no Gaussians.
     pub fn is_empty(&self) -> bool {
         self.count == 0
     }
 
+    /// Gaussians that the buffers have space for.
     pub fn capacity(&self) -> usize {
         self.capacity
     }
 
+    /// Degree of the spherical harmonics.
     pub fn sh_degree(&self) -> ShDegree {
         self.sh_degree
     }
@@ -99,14 +107,17 @@ impl GpuCloud {
         planes(self.sh_degree)
     }
 
+    /// Raw parameters, `[planes, capacity]` vec4.
     pub fn parameters(&self) -> &GpuBuffer {
         &self.parameters
     }
 
+    /// First moments of Adam, `[planes, capacity]` vec4.
     pub fn moments_1(&self) -> &GpuBuffer {
         &self.moments_1
     }
 
+    /// Second moments of Adam, `[planes, capacity]` vec4.
     pub fn moments_2(&self) -> &GpuBuffer {
         &self.moments_2
     }
@@ -117,6 +128,9 @@ impl GpuCloud {
     }
 
     /// Appends Gaussians with zero moments. Those that hold a NaN or an infinity are left out; their number is returned.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn append(&mut self, gpu: &Gpu, cloud: &GaussianCloud) -> Result<usize, GpuError> {
         assert_eq!(cloud.sh_degree, self.sh_degree, "a map has one spherical-harmonics degree");
         let finite: Vec<usize> = (0..cloud.len()).filter(|&i| is_finite(cloud, i)).collect();
@@ -138,24 +152,28 @@ impl GpuCloud {
         Ok(cloud.len() - finite.len())
     }
 
-    /// Keeps the Gaussians at `keep` (ascending indices) and appends a copy of each of `parents` with its own position, raw opacity and log
-    /// scale (planes 0 and 1). All keep their moments: a child goes on at its parent's lr_scale.
-    pub fn change(&mut self, gpu: &Gpu, keep: &[u32], (parents, geometry): (&[u32], &[[[f32; 4]; 2]])) -> Result<(), GpuError> {
-        let sources: Vec<u32> = keep.iter().chain(parents).copied().collect();
+    /// Applies a plan to the parameters, their averages and the moments. A child inherits its parent's moments.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit.
+    pub fn apply(&mut self, gpu: &Gpu, plan: &Plan) -> Result<(), GpuError> {
+        let sources: Vec<u32> = plan.keep.iter().copied().chain(plan.parents()).collect();
         let capacity = self.capacity_for(gpu, sources.len());
-        if keep.len() == self.count && parents.is_empty() && capacity == self.capacity {
+        if plan.keep.len() == self.count && plan.children.is_empty() && capacity == self.capacity {
             return Ok(());
         }
         self.rebuild(gpu, &sources, capacity)?;
-        for plane in 0..2 {
-            let values: Vec<[f32; 4]> = geometry.iter().map(|g| g[plane]).collect();
-            self.parameters.write(gpu, plane * self.capacity + keep.len(), &values);
-            self.averages.write(gpu, plane * self.capacity + keep.len(), &values);
+        let first = plan.keep.len();
+        let positions: Vec<[f32; 4]> = plan.children.iter().map(|c| c.mean.extend(c.raw_opacity).into()).collect();
+        let scales: Vec<[f32; 4]> = plan.children.iter().map(|c| c.log_scale.extend(0.0).into()).collect();
+        for (plane, values) in [positions, scales].iter().enumerate() {
+            self.parameters.write(gpu, plane * self.capacity + first, values);
+            self.averages.write(gpu, plane * self.capacity + first, values);
         }
         Ok(())
     }
 
-    /// Capacity for `needed` Gaussians: the present one, or twice as much within the limit and what the adapter can bind; if that is too
+    /// Room for `needed` Gaussians: the present one, or twice as much within the limit and what the adapter can bind; if that is too
     /// little, the allocation says how much is needed.
     fn capacity_for(&self, gpu: &Gpu, needed: usize) -> usize {
         let limit = self.limit.unwrap_or(usize::MAX).max(needed);
@@ -168,6 +186,9 @@ impl GpuCloud {
 
     /// Moves runs of Gaussians rigidly (new_from_old, in the world) and forgets their moments, which belong to where they were. On the
     /// host: this is rare. The harmonics above the constant stay as they are, for a closed loop turns little.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn transform(&mut self, gpu: &Gpu, runs: &[(Range<usize>, Se3)]) -> Result<(), GpuError> {
         if runs.is_empty() {
             return Ok(());
@@ -241,18 +262,39 @@ impl GpuCloud {
         [&self.parameters, &self.moments_1, &self.moments_2, &self.averages]
     }
 
-    /// Reads one plane of the map as it is shown, `[count]`: of the averages.
-    pub fn read_plane(&self, gpu: &Gpu, plane: usize) -> Result<Vec<[f32; 4]>, GpuError> {
+    /// Downloads the averaged geometry of all Gaussians, `[N]` in map order. Blocks until the GPU is idle.
+    ///
+    /// # Errors
+    /// [`GpuError`] if the device fails.
+    pub fn read_geometry(&self, gpu: &Gpu) -> Result<Vec<GaussianGeometry>, GpuError> {
+        let [positions, scales, rotations] = [0, 1, 2].map(|plane| self.read_plane(gpu, plane));
+        let (positions, scales, rotations) = (positions?, scales?, rotations?);
+        let geometry = |i: usize| {
+            let ([x, y, z, raw_opacity], [a, b, c, _], [qw, qx, qy, qz]) = (positions[i], scales[i], rotations[i]);
+            let (mean, log_scale, rotation) = (Vec3::new(x, y, z), Vec3::new(a, b, c), Quat::from_xyzw(qx, qy, qz, qw));
+            GaussianGeometry { mean, raw_opacity, log_scale, rotation }
+        };
+        Ok((0..self.count).map(geometry).collect())
+    }
+
+    /// Reads one plane of the averages, `[N]`.
+    fn read_plane(&self, gpu: &Gpu, plane: usize) -> Result<Vec<[f32; 4]>, GpuError> {
         self.averages.read(gpu, plane * self.capacity, self.count)
     }
 
     /// Reads the whole map as it is shown.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn download(&self, gpu: &Gpu) -> Result<GaussianCloud, GpuError> {
         let read = (0..self.planes()).map(|plane| self.read_plane(gpu, plane)).collect::<Result<Vec<_>, _>>()?;
         Ok(cloud_from_planes(self.sh_degree, &read))
     }
 
     /// All that training needs to go on as if it had never stopped.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn state(&self, gpu: &Gpu) -> Result<CloudState, GpuError> {
         let mut values = Vec::with_capacity(BUFFERS * self.planes() * self.count);
         for buffer in self.buffers() {
@@ -264,6 +306,9 @@ impl GpuCloud {
     }
 
     /// The map of a state, to the bit; `None` if that is no map of this degree.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn restore(gpu: &Gpu, sh_degree: ShDegree, state: &CloudState) -> Result<Option<Self>, GpuError> {
         let planes = planes(sh_degree);
         let count = state.values.len() / (BUFFERS * planes);

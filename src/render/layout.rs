@@ -9,17 +9,21 @@ use crate::splat::model::*;
 
 /// A tile is 16×8 pixels. On the software adapter 16×16 takes twice as long to blend: small Gaussians leave most of it untouched.
 pub const TILE_WIDTH: u32 = 16;
+/// Height of a tile, pixels.
 pub const TILE_HEIGHT: u32 = 8;
 /// Parts of the list of tiles from which successive workgroups of the blending passes take in turn.
 pub const LIST_PARTS: u32 = 16;
 /// Elements that one workgroup scans, and keys that one workgroup sorts.
 pub const SCAN_BLOCK: u32 = 2048;
+/// Keys that one workgroup sorts.
 pub const SORT_BLOCK: u32 = 1024;
 /// Blocks whose digit counts one workgroup scans.
 pub const SORT_CHUNK: u32 = 64;
 /// Counters in the counter buffer.
 pub const VISIBLE_COUNTER: u32 = 0;
+/// Counter of tile intersections.
 pub const INTERSECTION_COUNTER: u32 = 1;
+/// Number of counters.
 pub const COUNTERS: u32 = 2;
 
 /// Planes of vec4 that precede the higher harmonics: (position, raw opacity), (log scale, -), rotation (w, x, y, z), (constant colour, -).
@@ -39,6 +43,7 @@ pub enum BlendForm {
 }
 
 impl BlendForm {
+    /// Both forms.
     pub const ALL: [Self; 2] = [Self::Wide, Self::Narrow];
 
     /// The faster form on this adapter.
@@ -132,10 +137,12 @@ impl View {
         }
     }
 
+    /// Tiles of the image.
     pub fn tiles(&self) -> u32 {
         self.tiles_x * self.tiles_y
     }
 
+    /// Pixels of the image.
     pub fn pixels(&self) -> u32 {
         self.width * self.height
     }

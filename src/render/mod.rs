@@ -2,13 +2,16 @@
 
 mod cloud;
 pub mod layout;
+mod plan;
 mod rasterizer;
 pub(crate) mod shaders;
 mod sort;
 mod workspace;
 
-pub use cloud::{CloudState, GpuCloud, cloud_from_planes};
+pub(crate) use cloud::cloud_from_planes;
+pub use cloud::{CloudState, GpuCloud};
 pub use layout::BlendForm;
+pub use plan::{Child, GaussianGeometry, Plan};
 pub use rasterizer::{PreparedView, Rasterizer, Rendered, ViewCounts};
 pub use shaders::{SHADERS, ShaderSource};
 pub use workspace::Capacities;

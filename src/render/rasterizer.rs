@@ -10,7 +10,7 @@ use bytemuck::Zeroable;
 use super::cloud::GpuCloud;
 use super::layout::{BlendForm, COUNTERS, Counter, INTERSECTION_COUNTER, ScanSetup, TileListsSetup, VISIBLE_COUNTER, View};
 use super::shaders;
-use super::sort::{Scan, ScanJob, Sort};
+use super::sort::{Scan, ScanJob, Sort, SortJob};
 use super::workspace::{Capacities, Workspace};
 use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, workgroups};
 use crate::splat::{Exposure, ViewCamera};
@@ -21,7 +21,9 @@ const DEPTH_KEY_BITS: u32 = 32;
 /// A rendered view on the host.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Rendered {
+    /// Pixels along x.
     pub width: u32,
+    /// Pixels along y.
     pub height: u32,
     /// `[H, W]` colour over the background, and Σ w z in metres.
     pub color_depth: Vec<[f32; 4]>,
@@ -50,7 +52,9 @@ impl Rendered {
 /// Counts of a rendered view.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ViewCounts {
+    /// Gaussians that reach the image.
     pub visible: u32,
+    /// Intersections of Gaussians with tiles.
     pub intersections: u32,
 }
 
@@ -84,6 +88,7 @@ pub struct Rasterizer {
 /// A view prepared for encoding, and where its sorted intersections will lie.
 #[derive(Clone, Copy, Debug)]
 pub struct PreparedView {
+    /// Constants of the view, as uploaded.
     pub view: View,
     /// Which of `workspace.slots` holds the sorted intersections.
     pub sorted: usize,
@@ -91,12 +96,18 @@ pub struct PreparedView {
 
 impl Rasterizer {
     /// With the form of the blending passes that suits the adapter.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn new(gpu: Arc<Gpu>) -> Result<Self, GpuError> {
         let form = BlendForm::of(&gpu);
         Self::with_form(gpu, form)
     }
 
     /// With a given form of the blending passes.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn with_form(gpu: Arc<Gpu>, form: BlendForm) -> Result<Self, GpuError> {
         let kernel = |source: &shaders::ShaderSource| Kernel::new(&gpu, source.name, "main", &source.text(form));
         let kernels = Kernels {
@@ -123,6 +134,7 @@ impl Rasterizer {
         })
     }
 
+    /// The device that it runs on.
     pub fn gpu(&self) -> &Arc<Gpu> {
         &self.gpu
     }
@@ -132,6 +144,7 @@ impl Rasterizer {
         &self.view
     }
 
+    /// The form of the blending passes.
     pub fn form(&self) -> BlendForm {
         self.form
     }
@@ -142,15 +155,21 @@ impl Rasterizer {
     }
 
     /// Reserves scratch buffers of the given capacities.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn reserve(&mut self, capacities: Capacities) -> Result<(), GpuError> {
         self.workspace.reserve(&self.gpu, capacities)
     }
 
     /// Reserves buffers for the view and uploads it; it must be submitted before another is prepared.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn prepare(&mut self, cloud: &GpuCloud, camera: &ViewCamera, background: [f32; 3]) -> Result<PreparedView, GpuError> {
         let mut view = View::new(camera, background);
         self.workspace.reserve_gaussians(&self.gpu, cloud.capacity())?;
-        self.workspace.reserve_image(&self.gpu, (view.pixels(), view.tiles()))?;
+        self.workspace.reserve_image(&self.gpu, view.pixels(), view.tiles())?;
         view.gaussian_count = cloud.len() as u32;
         // All per-Gaussian buffers of the workspace are at least as long as the map's planes, whose stride both share.
         view.capacity = cloud.capacity() as u32;
@@ -195,7 +214,8 @@ impl Rasterizer {
             (6, &ws.intersection_counts),
         ];
         k.compact_visible.dispatch(gpu, pass, &compact, per_gaussian);
-        k.sort.encode(gpu, pass, ws, (&ws.depth_keys, &ws.order), (VISIBLE_COUNTER, DEPTH_KEY_BITS));
+        let by_depth = SortJob { keys: &ws.depth_keys, values: &ws.order, counter: VISIBLE_COUNTER, bits: DEPTH_KEY_BITS };
+        k.sort.encode(gpu, pass, ws, &by_depth);
         self.encode_tiles(pass, prepared);
         let bindings = [
             (0, uniform),
@@ -235,7 +255,8 @@ impl Rasterizer {
         k.scan.encode(gpu, pass, ws, &job);
         k.tile_lists.dispatch_indirect(gpu, pass, &lists(&self.emit_mode), visible);
         let tile_bits = u32::BITS - prepared.view.tiles().leading_zeros();
-        let sorted = k.sort.encode(gpu, pass, ws, (&ws.tile_keys, &ws.slots), (INTERSECTION_COUNTER, tile_bits));
+        let by_tile = SortJob { keys: &ws.tile_keys, values: &ws.slots, counter: INTERSECTION_COUNTER, bits: tile_bits };
+        let sorted = k.sort.encode(gpu, pass, ws, &by_tile);
         debug_assert_eq!(sorted, prepared.sorted);
         let ranges = [(0, &ws.counters), (1, &ws.tile_keys[sorted]), (2, &ws.ranges)];
         k.tile_ranges.dispatch_indirect(gpu, pass, &ranges, (&ws.counters, Counter::per_element_offset(INTERSECTION_COUNTER)));
@@ -243,6 +264,9 @@ impl Rasterizer {
     }
 
     /// Reads the counters of the last view; when its intersections did not fit, grows the buffers and returns `None`: repeat the step.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn finish(&mut self) -> Result<Option<ViewCounts>, GpuError> {
         let counters: Vec<Counter> = self.workspace.counters.read(&self.gpu, 0, COUNTERS as usize)?;
         let counts = self.counts(&counters);
@@ -258,6 +282,9 @@ impl Rasterizer {
     }
 
     /// Enlarges the intersection buffers to what the counters of a view need.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn reserve_for(&mut self, counters: &[Counter]) -> Result<(), GpuError> {
         let needed = counters[INTERSECTION_COUNTER as usize].needed as usize;
         if needed > self.workspace.intersection_capacity {
@@ -268,6 +295,9 @@ impl Rasterizer {
     }
 
     /// Renders a view and reads it back.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn render(&mut self, cloud: &GpuCloud, camera: &ViewCamera, background: [f32; 3]) -> Result<Rendered, GpuError> {
         loop {
             let prepared = self.prepare(cloud, camera, background)?;

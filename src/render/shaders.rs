@@ -4,8 +4,10 @@ use super::layout::{self, BlendForm};
 
 /// A composed shader, named as its stage.
 pub struct ShaderSource {
+    /// Name of the stage.
     pub name: &'static str,
     parts: &'static [&'static str],
+    /// Entry points of the module.
     pub entry_points: &'static [&'static str],
 }
 

@@ -58,6 +58,16 @@ impl Scan {
     }
 }
 
+/// Keys with their values to sort, double-buffered.
+pub(super) struct SortJob<'a> {
+    pub keys: &'a [GpuBuffer; 2],
+    pub values: &'a [GpuBuffer; 2],
+    /// Counter of the elements.
+    pub counter: u32,
+    /// Low bits of the keys that differ.
+    pub bits: u32,
+}
+
 #[derive(Debug)]
 pub(super) struct Sort {
     count_digits: Kernel,
@@ -82,16 +92,9 @@ impl Sort {
         })
     }
 
-    /// Sorts `counter` pairs of `keys[0]` and `values[0]` stably by their keys' low `bits`; returns which of the two buffers of each
-    /// holds the result.
-    pub fn encode(
-        &self,
-        gpu: &Gpu,
-        pass: &mut wgpu::ComputePass<'_>,
-        ws: &Workspace,
-        (keys, values): (&[GpuBuffer; 2], &[GpuBuffer; 2]),
-        (counter, bits): (u32, u32),
-    ) -> usize {
+    /// Sorts `keys[0]` and `values[0]` stably by the keys' low bits; returns which of the two buffers of each holds the result.
+    pub fn encode(&self, gpu: &Gpu, pass: &mut wgpu::ComputePass<'_>, ws: &Workspace, job: &SortJob<'_>) -> usize {
+        let SortJob { keys, values, counter, bits } = *job;
         let arguments = (&ws.counters, Counter::per_block_offset(counter));
         let chunks = (keys[0].raw().size() as u32 / 4).div_ceil(SORT_BLOCK * SORT_CHUNK);
         let passes = bits.div_ceil(DIGIT_BITS);

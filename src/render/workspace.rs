@@ -93,7 +93,7 @@ impl Workspace {
     pub(super) fn reserve(&mut self, gpu: &Gpu, capacities: Capacities) -> Result<(), GpuError> {
         self.reserve_gaussians(gpu, capacities.gaussians)?;
         self.grow_intersections(gpu, capacities.intersections)?;
-        self.reserve_image(gpu, (capacities.pixels, capacities.tiles))
+        self.reserve_image(gpu, capacities.pixels, capacities.tiles)
     }
 
     pub(super) fn reserve_gaussians(&mut self, gpu: &Gpu, capacity: usize) -> Result<(), GpuError> {
@@ -139,7 +139,7 @@ impl Workspace {
         Ok(())
     }
 
-    pub(super) fn reserve_image(&mut self, gpu: &Gpu, (pixels, tiles): (u32, u32)) -> Result<(), GpuError> {
+    pub(super) fn reserve_image(&mut self, gpu: &Gpu, pixels: u32, tiles: u32) -> Result<(), GpuError> {
         if tiles > self.tiles {
             self.ranges = GpuBuffer::storage(gpu, "ranges", u64::from(tiles) * 16)?;
             self.tiles = tiles;

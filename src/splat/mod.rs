@@ -16,6 +16,7 @@ pub use sh::ShDegree;
 /// the activated ones are `scale = exp(log_scale)`, `opacity = sigmoid(raw_opacity)`, `rotation / |rotation|`.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct GaussianCloud {
+    /// Degree of the spherical harmonics.
     pub sh_degree: ShDegree,
     /// `[N, 3]` world, metres.
     pub means: Vec<Vec3>,
@@ -32,22 +33,30 @@ pub struct GaussianCloud {
 /// One Gaussian, for building and looking at clouds.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Gaussian {
+    /// World, metres.
     pub mean: Vec3,
+    /// Natural logarithm of the standard deviations along its own axes, metres.
     pub log_scale: Vec3,
+    /// World from Gaussian, not necessarily of unit length.
     pub rotation: Quat,
+    /// Logit of the opacity.
     pub raw_opacity: f32,
+    /// `[K]` spherical-harmonics coefficients, RGB.
     pub sh: Vec<Vec3>,
 }
 
 impl GaussianCloud {
+    /// An empty map.
     pub fn new(sh_degree: ShDegree) -> Self {
         Self { sh_degree, ..Self::default() }
     }
 
+    /// Number of Gaussians.
     pub fn len(&self) -> usize {
         self.means.len()
     }
 
+    /// Whether there are no Gaussians.
     pub fn is_empty(&self) -> bool {
         self.means.is_empty()
     }
@@ -99,6 +108,7 @@ impl GaussianCloud {
 /// The map at one moment, as everyone but the mapper sees it.
 #[derive(Clone, Debug)]
 pub struct MapSnapshot {
+    /// The Gaussians.
     pub cloud: Arc<GaussianCloud>,
     /// Keyframes mapped so far.
     pub keyframes: usize,
@@ -111,6 +121,7 @@ pub fn raw_opacity_from_opacity(opacity: f32) -> f32 {
     (opacity / (1.0 - opacity)).ln()
 }
 
+/// The sigmoid: opacity of a raw opacity.
 pub fn opacity_from_raw(raw_opacity: f32) -> f32 {
     1.0 / (1.0 + (-raw_opacity).exp())
 }

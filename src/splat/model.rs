@@ -13,10 +13,13 @@ pub const ALPHA_MAX: f64 = 0.99;
 pub const TRANSMITTANCE_MIN: f64 = 1e-4;
 /// Gaussians nearer than this (their projection blows up) or farther than that are not drawn, metres.
 pub const NEAR_METRES: f64 = 0.05;
+/// Largest depth of a drawn Gaussian, metres.
 pub const FAR_METRES: f64 = 1e5;
 /// Added to the image covariance's diagonal, pixels²: the footprint of a pixel (3DGS).
 pub const DILATION: f64 = 0.3;
+/// Least determinant of an image covariance, pixels⁴.
 pub const MIN_DETERMINANT: f64 = 1e-6;
+/// Least squared norm of a rotation.
 pub const MIN_QUATERNION_NORM_SQUARED: f64 = 1e-8;
 /// How far beyond the image's edge, as a share of its size, the Jacobian follows x/z and y/z.
 pub const TANGENT_MARGIN: f64 = 0.15;
@@ -24,7 +27,9 @@ pub const TANGENT_MARGIN: f64 = 0.15;
 /// A camera to render from.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ViewCamera {
+    /// Intrinsics.
     pub pinhole: Pinhole,
+    /// Pose.
     pub camera_from_world: Se3,
 }
 

@@ -11,12 +11,15 @@ pub const SH_C0: f32 = 0.282_094_8;
 pub struct ShDegree(u8);
 
 impl ShDegree {
+    /// Degrees 0 to 3.
     pub const ALL: [Self; 4] = [Self(0), Self(1), Self(2), Self(3)];
 
+    /// The degree, if it is 0 to 3.
     pub fn new(degree: u8) -> Option<Self> {
         (degree <= 3).then_some(Self(degree))
     }
 
+    /// The degree as a number, 0 to 3.
     pub fn get(self) -> u8 {
         self.0
     }

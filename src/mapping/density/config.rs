@@ -1,4 +1,4 @@
-//! What density control can be told.
+//! Configuration of density control.
 
 use serde::{Deserialize, Serialize};
 
@@ -17,9 +17,11 @@ pub enum DensityStrategy {
     None,
 }
 
+/// Densification and pruning.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DensityConfig {
+    /// Which Gaussians are split, cloned or removed.
     pub strategy: DensityStrategy,
     /// Density is controlled each time after so many keyframes.
     pub every: usize,
@@ -32,7 +34,9 @@ pub struct DensityConfig {
     pub min_opacity: f32,
     /// Largest standard deviation, metres.
     pub max_scale_metres: f32,
+    /// Thresholds of [`DensityStrategy::MultiView`].
     pub multi_view: MultiViewConfig,
+    /// Thresholds of [`DensityStrategy::Classic`].
     pub classic: ClassicConfig,
 }
 
@@ -125,6 +129,9 @@ impl DensityConfig {
     }
 
     /// Says what is wrong with the values, if anything.
+    ///
+    /// # Errors
+    /// A description of the first invalid value.
     pub fn validate(&self) -> Result<(), String> {
         if self.every == 0 || self.views == 0 {
             return Err("every and views must be at least 1".into());

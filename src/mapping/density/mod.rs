@@ -3,12 +3,13 @@
 mod classic;
 mod multi_view;
 
-use glam::{Quat, Vec3};
+use glam::Vec3;
 
 pub use self::config::{ClassicConfig, DensityConfig, DensityStrategy, MultiViewConfig};
 
 use super::gaussian_stats::GaussianHistory;
 use crate::optimise::GaussianScore;
+use crate::render::{Child, GaussianGeometry, Plan};
 use crate::splat::{opacity_from_raw, raw_opacity_from_opacity};
 
 mod config;
@@ -16,30 +17,9 @@ mod config;
 /// What a strategy sees of a Gaussian.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Candidate {
-    pub mean: Vec3,
-    pub raw_opacity: f32,
-    pub log_scale: Vec3,
-    /// World from Gaussian.
-    pub rotation: Quat,
+    pub geometry: GaussianGeometry,
     pub score: GaussianScore,
     pub history: GaussianHistory,
-}
-
-/// A new Gaussian: its parent with another place, size and opacity.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Child {
-    pub parent: u32,
-    pub mean: Vec3,
-    pub raw_opacity: f32,
-    pub log_scale: Vec3,
-}
-
-/// What is to become of a map; indices are those before.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub(super) struct Plan {
-    /// Ascending.
-    pub keep: Vec<u32>,
-    pub children: Vec<Child>,
 }
 
 /// What a strategy says of one Gaussian.
@@ -56,15 +36,16 @@ pub(super) enum Verdict {
 impl Candidate {
     /// Its largest standard deviation in the view nearest to it, pixels.
     pub fn pixels(&self) -> f32 {
-        self.log_scale.max_element().exp() / self.score.metres_per_pixel.max(1e-9)
+        self.geometry.log_scale.max_element().exp() / self.score.metres_per_pixel.max(1e-9)
     }
 
     pub fn opacity(&self) -> f32 {
-        opacity_from_raw(self.raw_opacity)
+        opacity_from_raw(self.geometry.raw_opacity)
     }
 
     fn is_finite(&self) -> bool {
-        self.mean.is_finite() && self.raw_opacity.is_finite() && self.log_scale.is_finite() && self.rotation.is_finite()
+        let g = &self.geometry;
+        g.mean.is_finite() && g.raw_opacity.is_finite() && g.log_scale.is_finite() && g.rotation.is_finite()
     }
 }
 
@@ -80,7 +61,7 @@ pub(super) fn plan(candidates: &[Candidate], most: usize, config: &DensityConfig
     for (i, (candidate, verdict)) in (0..).zip(candidates.iter().zip(verdicts)) {
         let valid = candidate.is_finite()
             && candidate.opacity() >= config.min_opacity
-            && candidate.log_scale.max_element() <= config.max_scale_metres.ln();
+            && candidate.geometry.log_scale.max_element() <= config.max_scale_metres.ln();
         match verdict {
             _ if !valid => {}
             Verdict::Remove => {}
@@ -97,12 +78,13 @@ pub(super) fn plan(candidates: &[Candidate], most: usize, config: &DensityConfig
 /// Two in place of one, along its longest axis. Split: narrower ones that look together much as it did (their alphas differ from it by
 /// at most 0.07 of its own along the axis). Clone: two like it, with 1 - √(1 - α) each, so that both together let as much light pass.
 fn divide(parent: u32, of: &Candidate, clone: bool) -> [Child; 2] {
-    let scale = of.log_scale.exp();
+    let GaussianGeometry { mean, log_scale, rotation, .. } = of.geometry;
+    let scale = log_scale.exp();
     let longest = scale.max_position();
     let mut axis = Vec3::ZERO;
     axis[longest] = scale[longest];
-    let axis = of.rotation.normalize() * axis;
-    let mut log_scale = of.log_scale;
+    let axis = rotation.normalize() * axis;
+    let mut log_scale = log_scale;
     let (apart, opacity) = if clone {
         (0.25, 1.0 - (1.0 - of.opacity()).sqrt())
     } else {
@@ -110,20 +92,23 @@ fn divide(parent: u32, of: &Candidate, clone: bool) -> [Child; 2] {
         (0.6, 0.85 * of.opacity())
     };
     let raw_opacity = raw_opacity_from_opacity(opacity);
-    [-apart, apart].map(|side| Child { parent, mean: of.mean + side * axis, raw_opacity, log_scale })
+    [-apart, apart].map(|side| Child { parent, mean: mean + side * axis, raw_opacity, log_scale })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use glam::Quat;
 
     /// A disc of 10 cm by 2 cm a metre away, well seen and well placed.
     fn good() -> Candidate {
         Candidate {
-            mean: Vec3::new(0.0, 0.0, 1.0),
-            raw_opacity: raw_opacity_from_opacity(0.6),
-            log_scale: Vec3::new(0.02, 0.1, 0.01).map(f32::ln),
-            rotation: Quat::from_rotation_z(std::f32::consts::FRAC_PI_2),
+            geometry: GaussianGeometry {
+                mean: Vec3::new(0.0, 0.0, 1.0),
+                raw_opacity: raw_opacity_from_opacity(0.6),
+                log_scale: Vec3::new(0.02, 0.1, 0.01).map(f32::ln),
+                rotation: Quat::from_rotation_z(std::f32::consts::FRAC_PI_2),
+            },
             score: GaussianScore {
                 weight_sum: 80.0,
                 weight_max: 0.5,
@@ -133,6 +118,11 @@ mod tests {
             },
             history: GaussianHistory { age: 5, views: 12, best_weight: 0.5, contribution: 20.0, anchor: 0 },
         }
+    }
+
+    fn shaped(mut candidate: Candidate, change: impl Fn(&mut GaussianGeometry)) -> Candidate {
+        change(&mut candidate.geometry);
+        candidate
     }
 
     fn wrong() -> Candidate {
@@ -152,7 +142,7 @@ mod tests {
             multi_view: MultiViewConfig { max_growth: 1.0, ..MultiViewConfig::default() },
             ..DensityConfig::default()
         };
-        let fine = Candidate { log_scale: Vec3::splat(0.001f32.ln()), ..wrong() };
+        let fine = shaped(wrong(), |g| g.log_scale = Vec3::splat(0.001f32.ln()));
         let young = Candidate { history: GaussianHistory { age: 0, ..good().history }, ..wrong() };
         let unseen = Candidate { score: GaussianScore::default(), ..wrong() };
         let plan = plan(&[good(), wrong(), fine, young, unseen], 100, &config);
@@ -161,7 +151,7 @@ mod tests {
         assert_eq!((a.parent, b.parent), (1, 1));
         // Along the long axis, which the rotation lays along -x.
         assert!((a.mean - b.mean).length() > 0.1 && (a.mean - b.mean).y.abs() < 1e-6);
-        assert!((a.mean + b.mean - 2.0 * wrong().mean).length() < 1e-6 && a.log_scale.y < wrong().log_scale.y);
+        assert!((a.mean + b.mean - 2.0 * wrong().geometry.mean).length() < 1e-6 && a.log_scale.y < wrong().geometry.log_scale.y);
     }
 
     #[test]
@@ -170,9 +160,9 @@ mod tests {
         let hidden = Candidate { history: GaussianHistory { best_weight: 0.001, ..good().history }, ..good() };
         let speck = Candidate { history: GaussianHistory { contribution: 0.5, ..good().history }, ..good() };
         let new = Candidate { history: GaussianHistory::default(), ..hidden };
-        let nan = Candidate { mean: Vec3::NAN, ..good() };
-        let faint = Candidate { raw_opacity: raw_opacity_from_opacity(0.01), ..good() };
-        let huge = Candidate { log_scale: Vec3::splat(4.0), ..good() };
+        let nan = shaped(good(), |g| g.mean = Vec3::NAN);
+        let faint = shaped(good(), |g| g.raw_opacity = raw_opacity_from_opacity(0.01));
+        let huge = shaped(good(), |g| g.log_scale = Vec3::splat(4.0));
         let all = [good(), hidden, new, nan, faint, huge, speck];
         assert_eq!(plan(&all, 100, &config).keep, [0, 2]);
         // Without control of density only what went bad goes.

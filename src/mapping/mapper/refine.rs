@@ -4,7 +4,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::mapping::RefineConfig;
+use crate::mapping::{DensityConfig, RefineConfig};
 use crate::optimise::AdamConfig;
 
 use super::{BATCH, Mapper, MappingError, Step};
@@ -26,8 +26,11 @@ pub struct FinalRefinement {
 pub struct RefineReport {
     /// Steps since the beginning of the refinement.
     pub steps_done: usize,
+    /// Gaussians removed in this round.
     pub pruned: usize,
+    /// Gaussians added by splitting in this round.
     pub grown: usize,
+    /// Gaussians in the map afterwards.
     pub gaussians: usize,
     /// Mean PSNR of the round's views before each step.
     pub psnr_db: f32,
@@ -48,13 +51,18 @@ impl FinalRefinement {
 
 impl Mapper {
     /// Begins a refinement over the keyframes so far; none may come until it is done.
+    ///
+    /// # Errors
+    /// [`MappingError`] if a buffer does not fit or the device fails.
     pub fn begin_refinement(&mut self) -> Result<FinalRefinement, MappingError> {
         let config = self.config.refine.clone();
-        self.config.density.views = config.density_views;
         Ok(FinalRefinement { adam: self.config.adam.clone(), config, done: 0, epoch: Vec::new(), rounds: 0 })
     }
 
     /// The steps up to the next density control, and that; `None` when all are done, or `stop` says so.
+    ///
+    /// # Errors
+    /// [`MappingError`] if a buffer does not fit or the device fails.
     pub fn refine(
         &mut self,
         refinement: &mut FinalRefinement,
@@ -64,9 +72,9 @@ impl Mapper {
         if refinement.done >= steps || self.cloud.is_empty() || self.keyframes.is_empty() || stop() {
             return Ok(None);
         }
-        if refinement.progress() >= growth_share {
-            self.config.density = self.config.density.without_growth();
-        }
+        let density = DensityConfig { views: refinement.config.density_views, ..self.config.density.clone() };
+        let density = if refinement.progress() >= growth_share { density.without_growth() } else { density };
+        let mut adam = refinement.rates();
         let mut psnr = (0.0, 0);
         let end = steps.min(refinement.done + density_every);
         while refinement.done < end && !stop() {
@@ -74,13 +82,13 @@ impl Mapper {
             let keyframes: Vec<usize> =
                 (refinement.done..end.min(refinement.done + BATCH)).map(|_| self.draw_from(refinement)).collect();
             let batch: Vec<Step> = keyframes.into_iter().map(|keyframe| Step { keyframe, coarse, lr_scale: 1.0 }).collect();
-            self.config.adam = refinement.rates();
-            for report in self.steps(&batch, None)? {
+            adam = refinement.rates();
+            for report in self.steps(&batch, None, &adam)? {
                 psnr = (psnr.0 + report.loss.psnr_db(), psnr.1 + 1);
             }
             refinement.done += batch.len();
         }
-        let (pruned, grown) = if refinement.done < steps { self.score_and_control(refinement)? } else { (0, 0) };
+        let (pruned, grown) = if refinement.done < steps { self.score_and_control(refinement, &density, &adam)? } else { (0, 0) };
         let psnr_db = psnr.0 / psnr.1.max(1) as f32;
         Ok(Some(RefineReport { steps_done: refinement.done, pruned, grown, gaussians: self.cloud.len(), psnr_db }))
     }
@@ -94,13 +102,18 @@ impl Mapper {
     }
 
     /// Density control by views spread over all keyframes, others in each round.
-    fn score_and_control(&mut self, refinement: &mut FinalRefinement) -> Result<(usize, usize), MappingError> {
+    fn score_and_control(
+        &mut self,
+        refinement: &mut FinalRefinement,
+        density: &DensityConfig,
+        adam: &AdamConfig,
+    ) -> Result<(usize, usize), MappingError> {
         let mut views: Vec<usize> = (0..self.keyframes.len()).filter(|&k| self.keyframes[k].has_image()).collect();
         let count = views.len();
         views.rotate_left(refinement.rounds % count);
         refinement.rounds += 1;
-        refinement.done += self.score(&views)?;
+        refinement.done += self.score(&views, density, adam)?;
         self.stats.keyframe_mapped();
-        self.control_density()
+        self.control_density(density)
     }
 }

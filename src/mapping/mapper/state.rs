@@ -28,6 +28,9 @@ pub struct MapperState {
 
 impl Mapper {
     /// The state, and where the refinement stands if it has begun.
+    ///
+    /// # Errors
+    /// [`MappingError`] if a buffer does not fit or the device fails.
     pub fn state(&self, refinement: Option<&FinalRefinement>) -> Result<MapperState, MappingError> {
         Ok(MapperState {
             cloud: self.cloud.state(&self.gpu)?,
@@ -41,6 +44,9 @@ impl Mapper {
     }
 
     /// The mapper of a state, without its keyframes: see [`Self::insert_again`].
+    ///
+    /// # Errors
+    /// [`MappingError`] if a buffer does not fit or the device fails.
     pub fn restore(gpu: Arc<Gpu>, config: &MappingConfig, state: &MapperState) -> Result<Self, MappingError> {
         let mut mapper = Self::new(gpu, config)?;
         mapper.cloud = GpuCloud::restore(&mapper.gpu, config.sh_degree, &state.cloud)?.ok_or(MappingError::State)?;
@@ -55,6 +61,9 @@ impl Mapper {
     }
 
     /// Takes in the next keyframe of the state that the mapper was restored from, as it was then, and nothing else happens.
+    ///
+    /// # Errors
+    /// [`MappingError`] if a buffer does not fit or the device fails.
     pub fn insert_again(&mut self, keyframe: &Keyframe, state: &MapperState) -> Result<(), MappingError> {
         let not_the_same = || MappingError::NotTheSame { id: keyframe.id };
         let is_next = state.keyframes.get(self.keyframes.len()).is_some_and(|then| then.id == keyframe.id);

@@ -1,0 +1,51 @@
+//! Density control: steps that score the Gaussians, and the change that the scores lead to.
+
+use super::{Mapper, MappingError, Step};
+use crate::mapping::density::{self, Candidate};
+use crate::mapping::{DensityConfig, DensityStrategy};
+use crate::optimise::{AdamConfig, GaussianScore, WrongPixels};
+
+impl Mapper {
+    /// Whether, and by what, Gaussians are scored: for control of their density, or to know which to give up.
+    pub(super) fn scoring(&self, density: &DensityConfig) -> Option<WrongPixels> {
+        let wanted = density.strategy != DensityStrategy::None || self.config.limits.limits_gaussians();
+        wanted.then(|| density.wrong_pixels())
+    }
+
+    /// Removes and divides Gaussians by the scores of the steps just taken; returns how many fewer and how many more there are for it.
+    pub(super) fn control_density(&mut self, density: &DensityConfig) -> Result<(usize, usize), MappingError> {
+        if self.cloud.is_empty() {
+            return Ok((0, 0));
+        }
+        let scores = match self.scoring(density) {
+            Some(_) => self.trainer.read_scores(&self.cloud)?,
+            None => vec![GaussianScore::default(); self.cloud.len()],
+        };
+        self.stats.scored(&scores);
+        let geometry = self.cloud.read_geometry(&self.gpu)?;
+        let histories = self.stats.histories();
+        let candidates: Vec<Candidate> =
+            (0..self.cloud.len()).map(|i| Candidate { geometry: geometry[i], score: scores[i], history: histories[i] }).collect();
+        let plan = density::plan(&candidates, self.most_gaussians(), density);
+        let (before, children) = (self.cloud.len(), plan.children.len());
+        self.cloud.apply(&self.gpu, &plan)?;
+        self.stats.apply(&plan);
+        // Two children take their parent's place.
+        Ok((before - plan.keep.len() - children / 2, children / 2))
+    }
+
+    /// A last step of each of some keyframes of the window, evenly spread over it, that scores the Gaussians; returns their number.
+    pub(super) fn score(&mut self, window: &[usize], density: &DensityConfig, adam: &AdamConfig) -> Result<usize, MappingError> {
+        let Some(wrong) = self.scoring(density) else { return Ok(0) };
+        self.trainer.begin_scores(&self.cloud)?;
+        let views = density.views.min(window.len());
+        let chosen: Vec<Step> = (0..views)
+            .map(|k| Step {
+                keyframe: window[k * window.len() / views],
+                coarse: false,
+                lr_scale: self.config.window.final_lr_scale,
+            })
+            .collect();
+        Ok(self.steps(&chosen, Some(wrong), adam)?.len())
+    }
+}
