@@ -285,7 +285,8 @@ mod tests {
     #[test]
     fn the_resolved_configuration_reads_back_the_same() {
         let mut config = Config { adapter: Some("llvmpipe".into()), ..Config::default() };
-        config.sequence = Some(SequenceConfig { path: "kitchen".into(), layout: Some(Layout::Tum), sensor: None, camera: None });
+        config.sequence =
+            Some(SequenceConfig { path: "kitchen".into(), layout: Some(Layout::named("tum")), sensor: None, camera: None });
         config.replay.frames = Some((3, 9));
         assert_eq!(toml::from_str::<Config>(&config.to_toml()).unwrap(), config);
     }

@@ -15,7 +15,7 @@ use crate::geometry::{Se3, StampedPose};
 use crate::mapping::{DepthSource, Keyframe, MapperMessage, MappingConfig};
 use crate::recording::Recording;
 use crate::run_folder::FrameRecord;
-use crate::sequence::{Frame, KnownPoint, Layout, Rectifier, Sensor};
+use crate::sequence::{Frame, KnownPoint, Rectifier, Sensor};
 use crate::tracking::{KeyframePose, StageTimes};
 
 /// What the mapper's lengths are made for: the median distance, in metres, at which a camera sees things in a room.
@@ -115,7 +115,7 @@ impl Follower<'_> {
     }
 
     fn is_due(&self, index: usize, world_from_camera: &Se3) -> bool {
-        let photos = matches!(self.recording.sequence().layout, Layout::Colmap | Layout::Transforms);
+        let photos = self.recording.sequence().layout.is_photos();
         let far = |last: &Known| self.apart(last, world_from_camera) >= 1.0;
         !self.recording.config().replay.is_held_out(index) && (photos || self.keyframes.last().is_none_or(far))
     }

@@ -12,7 +12,8 @@ use std::sync::Arc;
 use nalgebra::UnitQuaternion;
 use serde::Deserialize;
 
-use super::{FrameEntry, Layout, Sensor, Sequence, SequenceError, checks, folder_name, read_text, stereo};
+use super::layouts::{LayoutRow, parse_text};
+use super::{FrameEntry, Sensor, Sequence, SequenceError, checks, folder_name, read_text, stereo};
 use crate::geometry::{Camera, Distortion, Pinhole, Se3, StampedPose, Trajectory};
 
 /// Left and right further apart than this do not belong together: the cameras are triggered by one signal.
@@ -20,11 +21,30 @@ const MAX_PAIR_NS: u64 = 1_000_000;
 /// Values in a `sensor.yaml`; the datasets' have about 50.
 const MAX_NODES: usize = 10_000;
 
-pub(super) fn recognise(folder: &Path) -> bool {
+/// The layout's row in [`super::layouts::LAYOUTS`].
+pub(super) const LAYOUT: LayoutRow = LayoutRow {
+    name: "euroc",
+    marker: "mav0/cam0",
+    help: "`mav0/cam0` and optionally `mav0/cam1`, each with `data.csv`, `sensor.yaml` and `data`.",
+    is_photos: false,
+    recognise: recognise,
+    open: |folder, _| open(folder),
+    parse: |bytes| {
+        parse_text(bytes, |text, path| {
+            vec![
+                parse_sensor(text, path).map(drop),
+                parse_rows(text, path).map(drop),
+                parse_truth(text, path, &Se3::identity()).map(drop),
+            ]
+        })
+    },
+};
+
+fn recognise(folder: &Path) -> bool {
     folder.join("mav0/cam0/data.csv").is_file()
 }
 
-pub(super) fn open(folder: &Path) -> Result<Sequence, SequenceError> {
+fn open(folder: &Path) -> Result<Sequence, SequenceError> {
     let (left, right) = (folder.join("mav0/cam0"), folder.join("mav0/cam1"));
     let lefts = read_list(&left)?;
     let has_right = right.join("data.csv").is_file();
@@ -38,7 +58,7 @@ pub(super) fn open(folder: &Path) -> Result<Sequence, SequenceError> {
         depth: None,
     };
     let entries = lefts.into_iter().map(entry).collect();
-    let mut sequence = Sequence::new(folder_name(folder), Layout::Euroc, camera, Sensor::Mono, entries);
+    let mut sequence = Sequence::new(folder_name(folder), &LAYOUT, camera, Sensor::Mono, entries);
     // Before the maps are made, which are as large as the calibration says.
     sequence.check_first_size()?;
     if has_right {
@@ -271,7 +291,7 @@ mod tests {
         assert!((pinhole.cx - 367.5).abs() < 10.0 && (pinhole.cy - 252.2).abs() < 10.0, "{pinhole:?}");
         assert!(sequence.camera.distortion.is_zero());
         let has_right: Vec<bool> = sequence.entries.iter().map(|entry| entry.right.is_some()).collect();
-        assert_eq!((sequence.layout, has_right), (Layout::Euroc, vec![true, false, true]));
+        assert_eq!((sequence.layout, has_right), (crate::sequence::Layout::of(&LAYOUT), vec![true, false, true]));
         assert_eq!(sequence.entries[1].timestamp_s, 1.05);
     }
 

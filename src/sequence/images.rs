@@ -25,7 +25,8 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
-use super::{FrameEntry, Layout, Sensor, Sequence, SequenceError, checks, folder_name, images_in, read_text};
+use super::layouts::{LayoutRow, parse_text};
+use super::{FrameEntry, Sensor, Sequence, SequenceError, checks, folder_name, images_in, read_text};
 use crate::geometry::{Camera, Distortion, Pinhole};
 
 pub(super) const FILE: &str = "camera.toml";
@@ -52,11 +53,22 @@ pub(super) fn usual_fps() -> f64 {
     30.0
 }
 
+/// The layout's row in [`super::layouts::LAYOUTS`].
+pub(super) const LAYOUT: LayoutRow = LayoutRow {
+    name: "images",
+    marker: "camera.toml",
+    help: "`camera.toml` and images in the folder itself, in `rgb` and optionally `depth`, or in `left` and `right`.",
+    is_photos: false,
+    recognise: recognise,
+    open: |folder, _| open(folder),
+    parse: |bytes| parse_text(bytes, |text, path| vec![parse_camera(text, path).map(drop)]),
+};
+
 pub(super) fn recognise(folder: &Path) -> bool {
     folder.join(FILE).is_file()
 }
 
-pub(super) fn open(folder: &Path) -> Result<Sequence, SequenceError> {
+fn open(folder: &Path) -> Result<Sequence, SequenceError> {
     let path = folder.join(FILE);
     let content = |what: &str| SequenceError::Content { path: path.clone(), what: what.into() };
     let (camera, file) = parse_camera(&read_text(&path)?, &path)?;
@@ -81,7 +93,7 @@ pub(super) fn open(folder: &Path) -> Result<Sequence, SequenceError> {
         None => (folder.into(), PathBuf::new(), Sensor::Mono),
     };
     let entries = entries(&color_folder, &other_folder, sensor, file.fps)?;
-    let sequence = Sequence::new(folder_name(folder), Layout::Images, camera, sensor, entries);
+    let sequence = Sequence::new(folder_name(folder), &LAYOUT, camera, sensor, entries);
     sequence.check_first_size()?;
     Ok(sequence)
 }
@@ -160,7 +172,10 @@ mod tests {
     fn the_folders_say_what_the_sensor_is() {
         for place in [".", "rgb"] {
             let sequence = open(&recording(&format!("fps = 4\n{PINHOLE}[distortion]\nk1 = 0.1\n"), &[place])).unwrap();
-            assert_eq!((sequence.layout, sequence.sensor, sequence.entries.len()), (Layout::Images, Sensor::Mono, 2));
+            assert_eq!(
+                (sequence.layout, sequence.sensor, sequence.entries.len()),
+                (crate::sequence::Layout::of(&LAYOUT), Sensor::Mono, 2)
+            );
             assert_eq!((sequence.camera.distortion.k1, sequence.entries[1].timestamp_s), (0.1, 0.25));
             assert!(sequence.groundtruth.is_none());
         }

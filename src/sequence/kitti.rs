@@ -6,7 +6,8 @@
 
 use std::path::{Path, PathBuf};
 
-use super::{FrameEntry, Layout, Sensor, Sequence, SequenceError, checks, folder_name, images_in, read_text};
+use super::layouts::{LayoutRow, SAMPLE_FRAMES, parse_text};
+use super::{FrameEntry, Sensor, Sequence, SequenceError, checks, folder_name, images_in, read_text};
 use crate::geometry::{Camera, Distortion, Pinhole, StampedPose, Trajectory};
 
 const FRAME_S: f64 = 0.1;
@@ -14,11 +15,28 @@ const FRAME_S: f64 = 0.1;
 const CAMERAS: [(&str, &str, &str, &str); 3] =
     [("image_2", "image_3", "P2", "P3"), ("image_0", "image_1", "P0", "P1"), ("image_l", "image_r", "P0", "P1")];
 
-pub(super) fn recognise(folder: &Path) -> bool {
+/// The layout's row in [`super::layouts::LAYOUTS`].
+pub(super) const LAYOUT: LayoutRow = LayoutRow {
+    name: "kitti",
+    marker: "calib.txt and image_0",
+    help: "`image_0` and `image_1` (or `image_2` and `image_3`), `calib.txt`, optionally `times.txt` and `poses.txt`.",
+    is_photos: false,
+    recognise: recognise,
+    open: |folder, _| open(folder),
+    parse: |bytes| {
+        parse_text(bytes, |text, path| {
+            let projection = Calibration::parse(text, path).and_then(|c| c.of("P0", 0).map(drop));
+            let poses = parse_poses(text, path, &[0.0; SAMPLE_FRAMES]).map(drop);
+            vec![projection, parse_times(text, path, SAMPLE_FRAMES).map(drop), poses]
+        })
+    },
+};
+
+fn recognise(folder: &Path) -> bool {
     folder.join("calib.txt").is_file() && CAMERAS.iter().any(|(left, ..)| folder.join(left).is_dir())
 }
 
-pub(super) fn open(folder: &Path) -> Result<Sequence, SequenceError> {
+fn open(folder: &Path) -> Result<Sequence, SequenceError> {
     let (left, right, left_name, right_name) = CAMERAS
         .into_iter()
         .find(|(left, ..)| folder.join(left).is_dir())
@@ -53,7 +71,7 @@ pub(super) fn open(folder: &Path) -> Result<Sequence, SequenceError> {
         .collect();
     let groundtruth = truth_file(folder).map(|path| parse_poses(&read_text(&path)?, &path, &times)).transpose()?;
     let camera = Camera { pinhole, distortion: Distortion::default(), depth_units_per_metre: 1.0 };
-    Ok(Sequence { groundtruth, ..Sequence::new(folder_name(folder), Layout::Kitti, camera, sensor, entries) })
+    Ok(Sequence { groundtruth, ..Sequence::new(folder_name(folder), &LAYOUT, camera, sensor, entries) })
 }
 
 /// The projections of a calibration file, each with its name where it has one.
@@ -167,7 +185,10 @@ mod tests {
     fn pairs_calibration_times_and_truth_are_read() {
         let folder = recording();
         let sequence = Sequence::open(folder.path(), None, None).unwrap();
-        assert_eq!((sequence.layout, sequence.sensor), (Layout::Kitti, Sensor::Stereo { baseline_metres: 0.5 }));
+        assert_eq!(
+            (sequence.layout, sequence.sensor),
+            (crate::sequence::Layout::of(&LAYOUT), Sensor::Stereo { baseline_metres: 0.5 })
+        );
         assert_eq!(sequence.camera.pinhole.fx, 7.0);
         assert!(sequence.entries.iter().all(|e| e.right.is_some()));
         assert!((sequence.entries[2].timestamp_s - 0.2).abs() < 1e-12);

@@ -1,6 +1,6 @@
 //! Recorded sequences: what a frame is, and one file per dataset layout that lists and reads them.
 //!
-//! Adding a layout takes one file and one row in [`Layout`].
+//! Adding a layout takes one file and one row in `layouts.rs`.
 
 mod cameras;
 mod checks;
@@ -9,7 +9,7 @@ mod euroc;
 mod files;
 mod images;
 mod kitti;
-mod parsing;
+mod layouts;
 mod rectify;
 mod replica;
 mod stereo;
@@ -21,6 +21,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use image::{GrayImage, RgbImage};
+use layouts::LayoutRow;
 use nalgebra::Vector3;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -29,65 +30,10 @@ use crate::geometry::{Camera, Trajectory, TrajectoryError};
 
 pub use cameras::is_file as is_camera_file;
 use files::{decode, files_in, folder_name, images_in, parse_json, read_text};
+pub use layouts::Layout;
 pub use rectify::{RectifiedImage, Rectifier};
 use stereo::StereoRemap;
 use video::Video;
-
-/// How a dataset lays out its files.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
-#[serde(rename_all = "kebab-case")]
-pub enum Layout {
-    /// `rgb.txt`, `depth.txt`, `groundtruth.txt`, and `camera.txt` or a folder name that says which TUM camera it was.
-    Tum,
-    /// `image_0` and `image_1` (or `image_2` and `image_3`), `calib.txt`, and perhaps `times.txt` and `poses.txt`.
-    Kitti,
-    /// `mav0/cam0` and perhaps `mav0/cam1`, each with `data.csv`, `sensor.yaml` and `data`, as the EuRoC MAV datasets have it.
-    Euroc,
-    /// `images` and COLMAP's model of them in `sparse/0`, binary or text: photos whose poses are known.
-    Colmap,
-    /// `results/frame*.jpg` and `results/depth*.png`, `traj.txt`, and `cam_params.json` there or one folder up: Replica by NICE-SLAM.
-    Replica,
-    /// `transforms.json`, as NeRF's data, instant-ngp and nerfstudio have it: photos whose poses are known.
-    Transforms,
-    /// A video file, its `camera.toml` beside it; or the folder that holds just these.
-    Video,
-    /// `camera.toml` and images in the folder itself, in `rgb` and perhaps `depth`, or in `left` and `right`.
-    Images,
-}
-
-impl Layout {
-    pub const ALL: [Self; 8] =
-        [Self::Tum, Self::Kitti, Self::Euroc, Self::Colmap, Self::Replica, Self::Transforms, Self::Video, Self::Images];
-
-    /// The layouts with their marker files, for messages.
-    fn known() -> String {
-        let of = |layout: Self| match layout {
-            Self::Tum => "tum: has rgb.txt",
-            Self::Kitti => "kitti: has calib.txt and image_0",
-            Self::Euroc => "euroc: has mav0/cam0",
-            Self::Colmap => "colmap: has images and sparse/0",
-            Self::Replica => "replica: has traj.txt and results",
-            Self::Transforms => "transforms: has transforms.json",
-            Self::Video => "video: has camera.toml and a video",
-            Self::Images => "images: has camera.toml",
-        };
-        Self::ALL.map(of).join(", ")
-    }
-
-    /// The layout whose marker files are in `folder`.
-    fn recognise(folder: &Path) -> Option<Self> {
-        Self::ALL.into_iter().find(|layout| match layout {
-            Self::Tum => folder.join("rgb.txt").is_file(),
-            Self::Kitti => kitti::recognise(folder),
-            Self::Euroc => euroc::recognise(folder),
-            Self::Colmap => colmap::recognise(folder),
-            Self::Replica => replica::recognise(folder),
-            Self::Transforms => transforms::recognise(folder),
-            Self::Video => video::recognise(folder),
-            Self::Images => images::recognise(folder),
-        })
-    }
-}
 
 /// What a recording's frames hold.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -242,28 +188,30 @@ impl Sequence {
     /// decoded, but a video is, once, for the times of its frames.
     /// `camera` names a preset (`tum-fr1`, …) to use instead of what a folder in TUM's layout says; for a video, also a `camera.toml`.
     pub fn open(folder: &Path, layout: Option<Layout>, camera: Option<&str>) -> Result<Self, SequenceError> {
-        if folder.is_file() && layout.is_none_or(|layout| layout == Layout::Video) {
-            return video::open(folder, camera);
+        let video = Layout::of(&video::LAYOUT);
+        if folder.is_file() && layout.is_none_or(|layout| layout == video) {
+            return video.open(folder, camera);
         }
         if !folder.is_dir() {
             return Err(SequenceError::Missing(folder.into()));
         }
         let layout = layout.or_else(|| Layout::recognise(folder)).ok_or_else(|| SequenceError::UnknownLayout(folder.into()))?;
-        match layout {
-            Layout::Tum => tum::open(folder, camera),
-            Layout::Kitti => kitti::open(folder),
-            Layout::Euroc => euroc::open(folder),
-            Layout::Colmap => colmap::open(folder),
-            Layout::Replica => replica::open(folder),
-            Layout::Transforms => transforms::open(folder),
-            Layout::Video => video::open(folder, camera),
-            Layout::Images => images::open(folder),
-        }
+        layout.open(folder, camera)
     }
 
     /// A recording without truth and known points.
-    fn new(name: String, layout: Layout, camera: Camera, sensor: Sensor, entries: Vec<FrameEntry>) -> Self {
-        Self { name, layout, camera, sensor, entries, groundtruth: None, points: Vec::new(), remap: None, video: None }
+    fn new(name: String, layout: &'static LayoutRow, camera: Camera, sensor: Sensor, entries: Vec<FrameEntry>) -> Self {
+        Self {
+            name,
+            layout: Layout::of(layout),
+            camera,
+            sensor,
+            entries,
+            groundtruth: None,
+            points: Vec::new(),
+            remap: None,
+            video: None,
+        }
     }
 
     /// Takes from the recording only what a sensor of this kind gives: a monocular replay of an RGB-D recording leaves its depth out.

@@ -8,16 +8,33 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
-use super::{FrameEntry, Layout, Sensor, Sequence, SequenceError, checks, folder_name, images_in, parse_json, read_text};
+use super::layouts::{LayoutRow, SAMPLE_FRAMES, parse_text};
+use super::{FrameEntry, Sensor, Sequence, SequenceError, checks, folder_name, images_in, parse_json, read_text};
 use crate::geometry::{Camera, Distortion, Pinhole, StampedPose, Trajectory};
 
 const FRAMES_PER_S: f64 = 30.0;
 
-pub(super) fn recognise(folder: &Path) -> bool {
+/// The layout's row in [`super::layouts::LAYOUTS`].
+pub(super) const LAYOUT: LayoutRow = LayoutRow {
+    name: "replica",
+    marker: "traj.txt and results",
+    help: "`results/frame*.jpg` and `results/depth*.png`, `traj.txt`, and `cam_params.json` there or one folder up.",
+    is_photos: false,
+    recognise: recognise,
+    open: |folder, _| open(folder),
+    parse: |bytes| {
+        parse_text(bytes, |text, path| {
+            let frames: Vec<usize> = (0..SAMPLE_FRAMES).collect();
+            vec![parse_camera(text, path).map(drop), parse_poses(text, path, frames.iter()).map(drop)]
+        })
+    },
+};
+
+fn recognise(folder: &Path) -> bool {
     folder.join("traj.txt").is_file() && folder.join("results").is_dir()
 }
 
-pub(super) fn open(folder: &Path) -> Result<Sequence, SequenceError> {
+fn open(folder: &Path) -> Result<Sequence, SequenceError> {
     let results = folder.join("results");
     let images = images_in(&results)?;
     let (colors, depths) = (numbered(&images, "frame"), numbered(&images, "depth"));
@@ -35,7 +52,7 @@ pub(super) fn open(folder: &Path) -> Result<Sequence, SequenceError> {
     let truth = folder.join("traj.txt");
     let groundtruth = Some(parse_poses(&read_text(&truth)?, &truth, colors.keys())?);
     let camera = read_camera(folder)?;
-    let sequence = Sequence { groundtruth, ..Sequence::new(folder_name(folder), Layout::Replica, camera, sensor, entries) };
+    let sequence = Sequence { groundtruth, ..Sequence::new(folder_name(folder), &LAYOUT, camera, sensor, entries) };
     sequence.check_first_size()?;
     Ok(sequence)
 }
@@ -133,7 +150,7 @@ mod tests {
     fn frames_depth_camera_and_poses_are_read() {
         let (_folder, room) = recording();
         let sequence = Sequence::open(&room, None, None).unwrap();
-        assert_eq!((sequence.layout, sequence.sensor), (Layout::Replica, Sensor::Rgbd));
+        assert_eq!((sequence.layout, sequence.sensor), (crate::sequence::Layout::of(&LAYOUT), Sensor::Rgbd));
         let has_depth: Vec<bool> = sequence.entries.iter().map(|entry| entry.depth.is_some()).collect();
         assert_eq!(has_depth, [true, true, false]);
         assert_eq!(sequence.load(1).unwrap().depth.unwrap().at(3, 3), Some(2.0));

@@ -12,18 +12,35 @@ use std::path::{Path, PathBuf};
 use nalgebra::{UnitQuaternion, Vector3};
 use serde::Deserialize;
 
-use super::{FrameEntry, Layout, Sensor, Sequence, SequenceError, checks, folder_name, parse_json, read_text};
+use super::layouts::{LayoutRow, SAMPLE_SIZE, parse_text};
+use super::{FrameEntry, Sensor, Sequence, SequenceError, checks, folder_name, parse_json, read_text};
 use crate::geometry::{Camera, Distortion, Pinhole, Se3, StampedPose, Trajectory};
 
 const FILE: &str = "transforms.json";
 /// Endings of photos whose path leaves it out.
 const ENDINGS: [&str; 4] = ["", ".png", ".jpg", ".jpeg"];
 
-pub(super) fn recognise(folder: &Path) -> bool {
+/// The layout's row in [`super::layouts::LAYOUTS`].
+pub(super) const LAYOUT: LayoutRow = LayoutRow {
+    name: "transforms",
+    marker: "transforms.json",
+    help: "`transforms.json` of NeRF, instant-ngp and nerfstudio: photos with known poses.",
+    is_photos: true,
+    recognise: recognise,
+    open: |folder, _| open(folder),
+    parse: |bytes| {
+        parse_text(bytes, |text, path| {
+            let what = |what| SequenceError::Content { path: path.into(), what };
+            vec![Transforms::parse(text, path).and_then(|file| file.lens.camera(SAMPLE_SIZE).map(drop).map_err(what))]
+        })
+    },
+};
+
+fn recognise(folder: &Path) -> bool {
     folder.join(FILE).is_file()
 }
 
-pub(super) fn open(folder: &Path) -> Result<Sequence, SequenceError> {
+fn open(folder: &Path) -> Result<Sequence, SequenceError> {
     let path = folder.join(FILE);
     let content = |what: String| SequenceError::Content { path: path.clone(), what };
     let Transforms { lens, photos } = Transforms::parse(&read_text(&path)?, &path)?;
@@ -41,7 +58,7 @@ pub(super) fn open(folder: &Path) -> Result<Sequence, SequenceError> {
     let camera = lens.camera(size).map_err(content)?;
     let groundtruth = Some(Trajectory { poses });
     let name = folder_name(folder);
-    let sequence = Sequence { groundtruth, ..Sequence::new(name, Layout::Transforms, camera, Sensor::Mono, entries) };
+    let sequence = Sequence { groundtruth, ..Sequence::new(name, &LAYOUT, camera, Sensor::Mono, entries) };
     sequence.check_first_size()?;
     Ok(sequence)
 }
@@ -188,7 +205,7 @@ mod tests {
     fn photos_lens_and_poses_are_read() {
         let folder = recording(LENS, FRAMES);
         let sequence = Sequence::open(folder.path(), None, None).unwrap();
-        assert_eq!((sequence.layout, sequence.sensor), (Layout::Transforms, Sensor::Mono));
+        assert_eq!((sequence.layout, sequence.sensor), (crate::sequence::Layout::of(&LAYOUT), Sensor::Mono));
         let pinhole = Pinhole { fx: 10.0, fy: 11.0, cx: 3.5, cy: 2.5, width: 8, height: 6 };
         assert_eq!(sequence.camera.pinhole, pinhole);
         assert_eq!(sequence.camera.distortion, Distortion { k1: 0.1, p2: 0.02, ..Distortion::default() });

@@ -5,7 +5,8 @@
 
 use std::path::{Path, PathBuf};
 
-use super::{FrameEntry, Layout, Sensor, Sequence, SequenceError, cameras, folder_name, read_text};
+use super::layouts::{LayoutRow, parse_text};
+use super::{FrameEntry, Sensor, Sequence, SequenceError, cameras, folder_name, read_text};
 use crate::geometry::{Camera, Distortion, Pinhole, Trajectory};
 
 /// Colour and depth further apart than this do not belong together (half a frame at 30 Hz, rounded up as the benchmark's tools do).
@@ -19,7 +20,18 @@ struct ListedImage {
 /// A line of a list: its number, its time in seconds, its file.
 type Listed<'a> = (usize, f64, &'a str);
 
-pub(super) fn open(folder: &Path, camera: Option<&str>) -> Result<Sequence, SequenceError> {
+/// The layout's row in [`super::layouts::LAYOUTS`].
+pub(super) const LAYOUT: LayoutRow = LayoutRow {
+    name: "tum",
+    marker: "rgb.txt",
+    help: "`rgb.txt`, `depth.txt`, `groundtruth.txt`, and `camera.txt` or a folder name that names a TUM camera.",
+    is_photos: false,
+    recognise: |folder| folder.join("rgb.txt").is_file(),
+    open: open,
+    parse: |bytes| parse_text(bytes, |text, path| vec![parse_list(text, path).map(drop), parse_camera(text, path).map(drop)]),
+};
+
+fn open(folder: &Path, camera: Option<&str>) -> Result<Sequence, SequenceError> {
     let name = folder_name(folder);
     let camera = match camera {
         Some(preset) => cameras::by_name(preset)?,
@@ -36,7 +48,7 @@ pub(super) fn open(folder: &Path, camera: Option<&str>) -> Result<Sequence, Sequ
     let sensor = if entries.iter().any(|entry| entry.depth.is_some()) { Sensor::Rgbd } else { Sensor::Mono };
     let groundtruth = folder.join("groundtruth.txt");
     let groundtruth = groundtruth.is_file().then(|| Trajectory::read_tum(&groundtruth)).transpose()?;
-    let sequence = Sequence { groundtruth, ..Sequence::new(name, Layout::Tum, camera, sensor, entries) };
+    let sequence = Sequence { groundtruth, ..Sequence::new(name, &LAYOUT, camera, sensor, entries) };
     sequence.check_first_size()?;
     Ok(sequence)
 }

@@ -2,8 +2,8 @@
 //! targets (`fuzz/corpus`); here they are damaged by seeded chance, there by what covers more code.
 
 use std::alloc::{GlobalAlloc, Layout as Memory, System};
+use std::cell::Cell;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicUsize, Ordering};
 
 use fastrand::Rng;
 use keysplat::config::Config;
@@ -12,21 +12,25 @@ use keysplat::geometry::Trajectory;
 use keysplat::sequence::Layout;
 use keysplat::synthetic::SceneConfig;
 
-/// Counts the bytes in use, and the most that ever were.
+/// Counts the bytes in use by each thread, and the most that ever were: a test is one thread, and others run beside it.
 struct Counting;
 
-static USED: AtomicUsize = AtomicUsize::new(0);
-static PEAK: AtomicUsize = AtomicUsize::new(0);
+thread_local! {
+    static USED: Cell<usize> = const { Cell::new(0) };
+    static PEAK: Cell<usize> = const { Cell::new(0) };
+}
 
 // SAFETY: everything is passed on to the system's allocator.
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, memory: Memory) -> *mut u8 {
-        PEAK.fetch_max(USED.fetch_add(memory.size(), Ordering::Relaxed) + memory.size(), Ordering::Relaxed);
+        USED.set(USED.get() + memory.size());
+        PEAK.set(PEAK.get().max(USED.get()));
         unsafe { System.alloc(memory) }
     }
 
     unsafe fn dealloc(&self, at: *mut u8, memory: Memory) {
-        USED.fetch_sub(memory.size(), Ordering::Relaxed);
+        // What another thread has allocated was not counted here.
+        USED.set(USED.get().saturating_sub(memory.size()));
         unsafe { System.dealloc(at, memory) }
     }
 }
@@ -42,8 +46,7 @@ const DAMAGED_EACH: usize = 400;
 fn parse(target: &str, bytes: &[u8]) -> usize {
     let path = Path::new("file");
     let text = || std::str::from_utf8(bytes).ok();
-    let layout = Layout::ALL.into_iter().find(|layout| format!("{layout:?}").eq_ignore_ascii_case(target));
-    match (layout, target) {
+    match (Layout::by_name(target), target) {
         (Some(layout), _) => layout.parse_files(bytes).iter().filter(|result| result.is_ok()).count(),
         (_, "ply") => usize::from(ply::read_from(bytes, bytes.len() as u64, path).is_ok()),
         (_, "trajectory") => usize::from(text().is_some_and(|text| Trajectory::parse_tum(text, path).is_ok())),
@@ -65,7 +68,10 @@ fn corpus() -> Vec<(String, PathBuf, Vec<u8>)> {
         let target = folder.file_name().unwrap().to_str().unwrap().to_owned();
         entries(&folder).into_iter().map(move |file| (target.clone(), file.clone(), std::fs::read(file).unwrap()))
     };
-    entries(&root).into_iter().flat_map(of_target).collect()
+    // One target has all layouts, a folder each.
+    let (layouts, targets): (Vec<_>, Vec<_>) = entries(&root).into_iter().partition(|folder| folder.ends_with("layouts"));
+    let layouts = layouts.iter().flat_map(|folder| entries(folder));
+    targets.into_iter().chain(layouts).flat_map(of_target).collect()
 }
 
 /// A copy with some bytes changed, lost, doubled, or replaced by numbers that lie.
@@ -90,7 +96,7 @@ fn damaged(rng: &mut Rng, bytes: &[u8]) -> Vec<u8> {
 }
 
 fn assert_bounded(what: &str) {
-    let peak = PEAK.load(Ordering::Relaxed);
+    let peak = PEAK.get();
     assert!(peak < MOST_BYTES, "{what} took {peak} bytes");
 }
 
@@ -98,7 +104,8 @@ fn assert_bounded(what: &str) {
 fn the_corpus_is_read_and_its_damaged_copies_do_no_harm() {
     let corpus = corpus();
     assert!(
-        Layout::ALL.iter().all(|layout| corpus.iter().any(|(target, ..)| format!("{layout:?}").eq_ignore_ascii_case(target)))
+        Layout::all().iter().all(|layout| corpus.iter().any(|(target, ..)| target == layout.name())),
+        "fuzz/corpus/layouts lacks a folder for a layout"
     );
     for (target, file, bytes) in corpus {
         assert!(parse(&target, &bytes) > 0, "{} is read by no parser", file.display());

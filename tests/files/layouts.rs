@@ -46,7 +46,10 @@ fn median_difference(sequence: &Sequence, world_from_camera: Se3, photo: &RgbIma
 fn photos_of_bonsai_show_the_points_of_their_model() {
     let Some(folder) = recorded("bonsai") else { return };
     let sequence = Sequence::open(&folder, None, None).unwrap();
-    assert_eq!((sequence.layout, sequence.sensor, sequence.entries.len()), (Layout::Colmap, Sensor::Mono, 292));
+    assert_eq!(
+        (sequence.layout, sequence.sensor, sequence.entries.len()),
+        (Layout::by_name("colmap").unwrap(), Sensor::Mono, 292)
+    );
     assert_eq!(sequence.points.len(), 81_223);
     let poses = &sequence.groundtruth.as_ref().unwrap().poses;
     assert_eq!(poses.len(), 292);

@@ -13,9 +13,11 @@ pub(super) mod text;
 mod tests;
 
 use std::fs::File;
+use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
-use super::{FrameEntry, Layout, Sensor, Sequence, SequenceError, checks, folder_name, read_text};
+use super::layouts::{LayoutRow, parse_text};
+use super::{FrameEntry, Sensor, Sequence, SequenceError, checks, folder_name, read_text};
 use crate::geometry::{Camera, Distortion, Pinhole, Se3, StampedPose, Trajectory};
 use binary::Records;
 
@@ -58,11 +60,22 @@ fn model_folder(folder: &Path) -> Option<PathBuf> {
     ["sparse/0", "sparse"].map(|model| folder.join(model)).into_iter().find(has_cameras)
 }
 
-pub(super) fn recognise(folder: &Path) -> bool {
+/// The layout's row in [`super::layouts::LAYOUTS`].
+pub(super) const LAYOUT: LayoutRow = LayoutRow {
+    name: "colmap",
+    marker: "images and sparse/0",
+    help: "`images` and COLMAP's model of them in `sparse/0`, binary or text: photos with known poses.",
+    is_photos: true,
+    recognise: recognise,
+    open: |folder, _| open(folder),
+    parse: parse,
+};
+
+fn recognise(folder: &Path) -> bool {
     folder.join("images").is_dir() && model_folder(folder).is_some()
 }
 
-pub(super) fn open(folder: &Path) -> Result<Sequence, SequenceError> {
+fn open(folder: &Path) -> Result<Sequence, SequenceError> {
     let model = model_folder(folder).ok_or_else(|| SequenceError::Missing(folder.join("sparse/0")))?;
     let (cameras, cameras_path) = read(&model, "cameras", binary::cameras, text::cameras)?;
     let (mut images, images_path) = read(&model, "images", binary::images, text::images)?;
@@ -99,7 +112,7 @@ pub(super) fn open(folder: &Path) -> Result<Sequence, SequenceError> {
     let sequence = Sequence {
         points,
         groundtruth: Some(groundtruth),
-        ..Sequence::new(folder_name(folder), Layout::Colmap, camera, Sensor::Mono, entries)
+        ..Sequence::new(folder_name(folder), &LAYOUT, camera, Sensor::Mono, entries)
     };
     sequence.check_first_size()?;
     Ok(sequence)
@@ -142,4 +155,17 @@ pub(super) fn camera_of(camera: &ModelCamera) -> Result<Camera, String> {
     let side = |pixels| checks::side(pixels).ok_or_else(|| format!("{pixels} pixels are no size of an image"));
     let pinhole = Pinhole { fx, fy, cx: cx - 0.5, cy: cy - 0.5, width: side(camera.width)?, height: side(camera.height)? };
     checks::camera(Camera { pinhole, distortion: Distortion { k1, k2, p1, p2, k3: 0.0 }, depth_units_per_metre: 1.0 })
+}
+
+/// The three parts of a model, each as text and as binary.
+fn parse(bytes: &[u8]) -> Vec<Result<(), SequenceError>> {
+    let path = Path::new("file");
+    let records = || Records::new(Cursor::new(bytes), bytes.len() as u64, path);
+    let known = |cameras: Vec<ModelCamera>| cameras.iter().for_each(|camera| drop(camera_of(camera)));
+    let mut results =
+        vec![binary::cameras(records()).map(known), binary::images(records()).map(drop), binary::points(records()).map(drop)];
+    results.extend(parse_text(bytes, |text, path| {
+        vec![text::cameras(text, path).map(known), text::images(text, path).map(drop), text::points(text, path).map(drop)]
+    }));
+    results
 }

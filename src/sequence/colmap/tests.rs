@@ -64,7 +64,7 @@ fn error(folder: &tempfile::TempDir) -> String {
 fn both_forms_give_the_same_photos_poses_and_points() {
     for folder in [recording(), binary_recording()] {
         let mut sequence = Sequence::open(folder.path(), None, None).unwrap();
-        assert_eq!((sequence.layout, sequence.sensor), (Layout::Colmap, Sensor::Mono));
+        assert_eq!((sequence.layout, sequence.sensor), (crate::sequence::Layout::named("colmap"), Sensor::Mono));
         let pinhole = Pinhole { fx: 10.0, fy: 11.0, cx: 3.5, cy: 2.5, width: 8, height: 6 };
         assert_eq!(sequence.camera.pinhole, pinhole);
         assert_eq!(sequence.camera.distortion, Distortion { k1: 0.1, k2: -0.2, p1: 0.003, p2: 0.004, k3: 0.0 });

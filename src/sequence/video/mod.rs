@@ -12,12 +12,14 @@ mod decoder;
 mod tests;
 
 use std::fs::File;
+use std::io::Cursor;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use image::RgbImage;
 
-use super::{FrameEntry, Layout, Sensor, Sequence, SequenceError, cameras, files_in, images, images_in, read_text};
+use super::layouts::LayoutRow;
+use super::{FrameEntry, Sensor, Sequence, SequenceError, cameras, files_in, images, images_in, read_text};
 use crate::geometry::Camera;
 use container::Container;
 use decoder::Decoder;
@@ -28,22 +30,38 @@ const MOST_MISSING: usize = 1_000_000;
 /// Frames that a decoder holds back: 16 to put them in order (H.264), and one for each of its threads.
 const MOST_DELAYED: usize = 32;
 
+/// The layout's row in [`super::layouts::LAYOUTS`].
+pub(super) const LAYOUT: LayoutRow = LayoutRow {
+    name: "video",
+    marker: "camera.toml and a video",
+    help: "A video file with its `camera.toml` beside it, or a folder with these two alone.",
+    is_photos: false,
+    recognise: recognise,
+    open: open,
+    parse: |bytes| {
+        let io = |source| SequenceError::Read { path: Path::new("file").into(), source };
+        let is_cut = |container: Container| container.is_cut(Cursor::new(bytes)).map_err(io);
+        let container = Container::of(bytes).map_err(io).map(|container| container.map(is_cut));
+        vec![container.and_then(|is_cut| is_cut.transpose().map(drop))]
+    },
+};
+
 /// Whether a folder holds a video and its camera, and no images that would be taken first.
-pub(super) fn recognise(folder: &Path) -> bool {
+fn recognise(folder: &Path) -> bool {
     let has_images = ["rgb", "left"].iter().any(|name| folder.join(name).is_dir());
     let some = |files: Result<Vec<PathBuf>, _>| files.is_ok_and(|files| !files.is_empty());
     images::recognise(folder) && !has_images && !some(images_in(folder)) && some(files_in(folder, &EXTENSIONS))
 }
 
 /// Opens a video or the folder that holds one. `camera` names a preset or another `camera.toml`.
-pub(super) fn open(path: &Path, camera: Option<&str>) -> Result<Sequence, SequenceError> {
+fn open(path: &Path, camera: Option<&str>) -> Result<Sequence, SequenceError> {
     let path = if path.is_dir() { only_video_in(path)? } else { path.into() };
     let read_error = |source| SequenceError::Read { path: path.clone(), source };
     let mut file = File::open(&path).map_err(read_error)?;
     let container = Container::of(&file).map_err(read_error)?.ok_or_else(|| SequenceError::NoVideo { path: path.clone() })?;
     let (camera, usual_fps) = camera_of(&path, camera)?;
     let name = path.file_stem().map_or_else(|| "video".into(), |stem| stem.to_string_lossy().into_owned());
-    let mut sequence = Sequence::new(name, Layout::Video, camera, Sensor::Mono, Vec::new());
+    let mut sequence = Sequence::new(name, &LAYOUT, camera, Sensor::Mono, Vec::new());
     let is_cut = container.is_cut(&mut file).map_err(read_error)?;
     let check_size = |(width, height)| {
         if (height, width) == (camera.pinhole.width, camera.pinhole.height) && width != height {

@@ -65,7 +65,7 @@ fn frames_come_out_as_they_went_in_with_the_times_of_the_container() {
     let (folder, video) = recording();
     for path in [folder.path(), &video] {
         let sequence = open(path);
-        assert_eq!((sequence.layout, sequence.sensor, sequence.name.as_str()), (Layout::Video, Sensor::Mono, "walk"));
+        assert_eq!((sequence.layout, sequence.sensor, sequence.name.as_str()), (Layout::named("video"), Sensor::Mono, "walk"));
         assert_eq!(sequence.entries.len(), FRAMES);
         for index in 0..FRAMES {
             let frame = sequence.load(index).unwrap();
@@ -139,7 +139,7 @@ fn what_is_no_video_or_has_no_camera_is_refused() {
     assert!(error(&unknown).contains("unknown.mp4: no frame can be decoded; play it"), "{}", error(&unknown));
     assert!(error(&folder.path().join("walks.avi")).contains("there is no folder or video"));
     assert!(error(folder.path()).contains("several videos"));
-    let as_tum = Sequence::open(&video, Some(Layout::Tum), None).unwrap_err().to_string();
+    let as_tum = Sequence::open(&video, Some(Layout::named("tum")), None).unwrap_err().to_string();
     assert!(as_tum.contains("there is no folder"), "{as_tum}");
 
     let camera = |text: &str| file("camera.toml", text.as_bytes());
@@ -166,9 +166,9 @@ fn images_go_before_a_video_unless_the_layout_is_named() {
     std::fs::create_dir(folder.path().join("rgb")).unwrap();
     picture(0).save(folder.path().join("rgb/0.png")).unwrap();
     let sequence = open(folder.path());
-    assert_eq!((sequence.layout, sequence.entries.len()), (Layout::Images, 1));
-    let sequence = Sequence::open(folder.path(), Some(Layout::Video), None).unwrap();
-    assert_eq!((sequence.layout, sequence.entries.len()), (Layout::Video, FRAMES));
+    assert_eq!((sequence.layout, sequence.entries.len()), (Layout::named("images"), 1));
+    let sequence = Sequence::open(folder.path(), Some(Layout::named("video")), None).unwrap();
+    assert_eq!((sequence.layout, sequence.entries.len()), (Layout::named("video"), FRAMES));
 }
 
 #[test]

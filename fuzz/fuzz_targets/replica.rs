@@ -1,7 +1,0 @@
-//! Files of the layout, see `Layout::parse_files`.
-#![no_main]
-
-use keysplat::sequence::Layout;
-use libfuzzer_sys::fuzz_target;
-
-fuzz_target!(|bytes: &[u8]| drop(Layout::Replica.parse_files(bytes)));
