@@ -116,19 +116,27 @@ pub fn bench(args: &BenchArgs, verbosity: Verbosity) -> miette::Result<()> {
     }
 }
 
-fn step(args: &StepArgs) -> miette::Result<()> {
-    let gpu = Gpu::open_profiled(args.adapter.as_deref()).into_diagnostic()?;
-    let rates = measure_rates(&gpu).into_diagnostic()?;
-    let tile_sampling = args.tile_share.map(|share| TileSampling { share, min_share: 0.1, noise: 0.0 });
-    let form = args.form.map_or(BlendForm::of(&gpu), BlendForm::from);
-    let mut report = Report {
+/// A report without steps.
+fn empty_report(gpu: &Gpu, rates: Rates) -> Report {
+    Report {
         adapter: gpu.adapter.clone(),
         cpu: keysplat::evaluation::machine::cpu_name(),
         version: env!("CARGO_PKG_VERSION"),
         rates,
         steps: Vec::new(),
         too_large: Vec::new(),
-    };
+    }
+}
+
+fn step(args: &StepArgs) -> miette::Result<()> {
+    let gpu = Gpu::open_profiled(args.adapter.as_deref()).into_diagnostic()?;
+    let rates = measure_rates(&gpu).into_diagnostic()?;
+    let tile_sampling = args.tile_share.map(|share| TileSampling { share, min_share: 0.1, noise: 0.0 });
+    let form = args.form.map_or(BlendForm::of(&gpu), BlendForm::from);
+    let steps = args.steps;
+    let config =
+        |gaussians, width, height, sh_degree| StepBench { gaussians, width, height, sh_degree, form, tile_sampling, steps };
+    let mut report = empty_report(&gpu, rates);
     if !args.json {
         println!("{} [{}, {}]", gpu.adapter.name, gpu.adapter.kind, gpu.adapter.driver);
         println!("copy {:.1} GB/s   multiply-add {:.1} GFLOP/s", rates.bytes_per_s * 1e-9, rates.flops_per_s * 1e-9);
@@ -159,17 +167,14 @@ fn step(args: &StepArgs) -> miette::Result<()> {
             let depth = view.image.depth.as_ref().map(|depth| depth.metres.as_slice());
             let scene = BenchScene::of_map(&gpu, &cloud, camera, &view.image.color, depth);
             let sh_degree = cloud.sh_degree;
-            measure(
-                scene,
-                StepBench { gaussians: cloud.len(), width, height, sh_degree, form, tile_sampling, steps: args.steps },
-            )?;
+            measure(scene, config(cloud.len(), width, height, sh_degree))?;
             continue;
         }
         for &(width, height) in &args.size {
             for &degree in &args.sh {
                 let sh_degree = ShDegree::new(degree).ok_or_else(|| miette!("--sh takes degrees 0 to 3, not {degree}"))?;
                 let scene = BenchScene::new(&gpu, gaussians, (width, height), sh_degree);
-                measure(scene, StepBench { gaussians, width, height, sh_degree, form, tile_sampling, steps: args.steps })?;
+                measure(scene, config(gaussians, width, height, sh_degree))?;
             }
         }
     }
