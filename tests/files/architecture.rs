@@ -16,7 +16,7 @@ const ALLOWED: [(&str, &[&str]); 22] = [
     ("synthetic", &["geometry"]),
     ("splat", &["geometry"]),
     ("tracking", &["geometry", "sequence"]),
-    ("gpu", &["geometry", "splat"]),
+    ("gpu", &[]),
     ("render", &["geometry", "splat", "gpu"]),
     ("optimise", &["geometry", "splat", "gpu", "render"]),
     ("bench", &["geometry", "splat", "gpu", "render", "optimise"]),

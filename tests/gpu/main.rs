@@ -4,6 +4,7 @@
 mod common;
 
 mod against_reference;
+mod embedding;
 mod failures;
 mod long_optimisation;
 mod loop_moves_map;

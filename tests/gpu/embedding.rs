@@ -1,7 +1,5 @@
 //! A program with a wgpu device of its own embeds the trainer: `Gpu::from_device`.
 
-mod common;
-
 use std::sync::Arc;
 
 use fastrand::Rng;
@@ -24,14 +22,14 @@ fn device(change: fn(&mut wgpu::Limits)) -> (wgpu::Adapter, wgpu::Device, wgpu::
 
 #[test]
 fn a_step_on_the_programs_own_device_moves_the_map() {
-    if common::recording::skipped_without_adapter() {
+    if crate::common::recording::skipped_without_adapter() {
         return;
     }
     let (adapter, device, queue) = device(|_| ());
     let gpu = Gpu::from_device(&adapter, device.clone(), queue).unwrap();
     let mut rng = Rng::with_seed(3);
-    let camera = common::camera(&mut rng, 48, 32);
-    let cloud = common::scene(&mut rng, 60, ShDegree::default());
+    let camera = crate::common::camera(&mut rng, 48, 32);
+    let cloud = crate::common::scene(&mut rng, 60, ShDegree::default());
     let mut on_gpu = GpuCloud::new(&gpu, cloud.sh_degree, cloud.len()).unwrap();
     on_gpu.append(&gpu, &cloud).unwrap();
     let target = TargetImage::new(&gpu, &RgbImage::from_pixel(48, 32, image::Rgb([90, 120, 60])), None).unwrap();
@@ -46,7 +44,7 @@ fn a_step_on_the_programs_own_device_moves_the_map() {
 
 #[test]
 fn a_device_that_lacks_a_limit_is_refused_by_the_limits_name() {
-    if common::recording::skipped_without_adapter() {
+    if crate::common::recording::skipped_without_adapter() {
         return;
     }
     let (adapter, device, queue) = device(|limits| limits.max_storage_buffers_per_shader_stage = 4);
