@@ -226,7 +226,7 @@ impl fmt::Display for Metrics {
         let centimetres = |metres: Option<f64>| cell(metres.map(|m| 100.0 * m), 2, "cm");
         let sensor = format!("{:?}", self.sensor).to_lowercase();
         let lost_percent = 100.0 * self.frames.saturating_sub(self.frames_tracked) as f64 / self.frames.max(1) as f64;
-        row("sequence", format!("{} ({sensor}, {})", self.sequence, if self.paced { "paced" } else { "unpaced" }))?;
+        row("sequence", format!("{} ({sensor}, {})", self.sequence, if self.paced { "real time" } else { "deterministic" }))?;
         let keyframes = self.keyframes.map_or_else(|| "–".into(), |n| n.to_string());
         let late = if self.paced { format!(", {} late", self.frames_late) } else { String::new() };
         row("frames", format!("{}, {keyframes} keyframes, {} unreadable{late}", self.frames, self.frames_read_failed))?;
@@ -236,7 +236,7 @@ impl fmt::Display for Metrics {
         row("RPE per frame", format!("{}   {degrees}", cell(self.rpe.trans_m_per_frame.map(|m| 1000.0 * m), 2, "mm")))?;
         for (name, figures) in [
             ("held-out images", self.images.held_out),
-            ("  in the map's colours", self.images.held_out_map_colors),
+            ("  in own colours", self.images.held_out_map_colors),
             ("all images", self.images.all_frames),
             ("images as MonoGS", self.images.monogs),
         ] {
@@ -325,6 +325,8 @@ mod tests {
         assert!(table.contains("ATE RMSE              1.00 cm   lost frames 5.0 %\n"), "{table}");
         assert!(table.contains("whole run             90.0 s   resumed 2×\n"), "{table}");
         assert!(table.contains("held-out images       –\n"), "{table}");
+        let names = table.lines().filter_map(|line| line.split("PSNR").next().filter(|name| *name != line));
+        assert!(names.clone().count() > 0 && names.clone().all(|name| name.ends_with(' ')), "{table}");
         assert!(table.contains("PSNR 24.50 dB   SSIM 0.8600   depth L1 2.00 cm   (600 images)\n"), "{table}");
     }
 

@@ -35,7 +35,7 @@ fn escaped(text: &str) -> String {
 }
 
 fn summary(m: &Metrics) -> String {
-    let replay = if m.paced { "paced" } else { "unpaced" };
+    let replay = if m.paced { "real time" } else { "deterministic" };
     let resumed = if m.resumed > 0 { format!(", resumed {}×", m.resumed) } else { String::new() };
     let adapter = m.adapter.as_ref().map_or_else(String::new, |a| format!(", on {}", a.name));
     escaped(&format!("{} of {} frames tracked, {}, {replay}{resumed}{adapter}", m.frames_tracked, m.frames, m.sensor))

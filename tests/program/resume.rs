@@ -174,7 +174,7 @@ fn a_refinement_goes_on_where_it_stood() {
     assert_eq!(metrics(&out).resumed, 1);
     // The report says it too.
     finish(keysplat(["report".as_ref(), out.as_os_str()])).succeeded();
-    assert!(std::fs::read_to_string(out.join("report.html")).unwrap().contains("unpaced, resumed 1×"));
+    assert!(std::fs::read_to_string(out.join("report.html")).unwrap().contains("deterministic, resumed 1×"));
 }
 
 #[cfg(unix)]
