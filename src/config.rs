@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
+use crate::export::MapFormat;
 use crate::mapping::MappingConfig;
 use crate::sequence::{Layout, SensorKind};
 use crate::tracking::TrackingConfig;
@@ -20,6 +21,8 @@ pub struct Config {
     pub adapter: Option<String>,
     /// Mapping resolution as a share of the recorded one.
     pub map_scale: f64,
+    /// File format of the map.
+    pub map_format: MapFormat,
     /// Keyframes mapped, and rounds of the refinement, between two checkpoints; none are kept where absent.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub checkpoint_every: Option<usize>,
@@ -68,6 +71,7 @@ impl Default for Config {
             sequence: None,
             adapter: None,
             map_scale: 1.0,
+            map_format: MapFormat::default(),
             checkpoint_every: None,
             replay: ReplayConfig::default(),
             tracking: TrackingConfig::default(),

@@ -7,7 +7,6 @@ use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand, ValueEnum};
 use keysplat::bench::{BenchScene, Rates, StepBench, StepReport, bench_step, measure_rates};
-use keysplat::export::MapFormat;
 use keysplat::geometry::{Pinhole, Se3, Trajectory};
 use keysplat::gpu::{AdapterSummary, Gpu, GpuError};
 use keysplat::optimise::TileSampling;
@@ -209,7 +208,8 @@ impl RecordedView {
         let frame = sequence.entries.partition_point(|e| e.timestamp_s < middle.timestamp_s - 1e-4);
         let rectifier = Rectifier::new(&sequence.camera, config.map_scale);
         let image = rectifier.rectify(&sequence.load(frame.min(sequence.entries.len() - 1)).into_diagnostic()?);
-        let cloud = MapFormat::Ply.read(&dir.join(outputs::MAP)).into_diagnostic()?;
+        let (map, format) = outputs::find_map(dir).ok_or_else(|| miette!("{} has no map", dir.display()))?;
+        let cloud = format.read(&map).into_diagnostic()?;
         Ok(Self { cloud, world_from_camera: middle.world_from_camera, image })
     }
 }

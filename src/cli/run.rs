@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 use clap::Args;
 use indicatif::ProgressBar;
 use keysplat::config::SequenceConfig;
+use keysplat::export::MapFormat;
 use keysplat::presets::{self, Preset};
 use keysplat::sequence::{Layout, SensorKind, is_camera_file};
 use keysplat::{Config, Gpu, Progress, Recording, Session, SessionError};
@@ -36,6 +37,9 @@ pub struct RunArgs {
     /// Mapping resolution as a share of the recorded one, e.g. 0.5.
     #[arg(long)]
     map_scale: Option<f64>,
+    /// File format of the map, `map.<extension>` in the folder of the results.
+    #[arg(long, value_enum)]
+    format: Option<MapFormat>,
     /// Replay every n-th frame.
     #[arg(long)]
     every: Option<usize>,
@@ -123,6 +127,7 @@ impl RunArgs {
             sequence.camera = Some(if is_camera_file(camera) { absolute(camera)? } else { camera.clone() });
         }
         config.map_scale = self.map_scale.unwrap_or(config.map_scale);
+        config.map_format = self.format.unwrap_or(config.map_format);
         config.replay.every = self.every.unwrap_or(config.replay.every);
         config.replay.frames = self.frames.or(config.replay.frames);
         config.replay.real_time |= self.real_time;

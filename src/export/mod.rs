@@ -1,62 +1,155 @@
 //! Map formats, one file of code each.
 //!
-//! Adding a format takes one file and one row in [`MapFormat`]. Trajectories are written by [`crate::geometry::Trajectory`].
+//! Adding a format takes one file and one row in `FORMATS`. Trajectories are written by [`crate::geometry::Trajectory`].
 
-pub mod ply;
+mod ply;
 
+use std::fs::File;
+use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 
-use serde::{Deserialize, Serialize};
+use clap::builder::PossibleValue;
+use serde::{Deserialize, Deserializer, Serialize, Serializer, de};
 
 use crate::files::{WriteError, write_atomically};
 use crate::splat::GaussianCloud;
 
-/// The formats a map can be exported to and read from.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
-#[serde(rename_all = "kebab-case")]
-pub enum MapFormat {
-    /// The PLY of the 3D Gaussian Splatting reference code, binary little endian: what every viewer reads.
-    #[default]
-    Ply,
+/// All formats; the first one is the default.
+static FORMATS: [MapFormat; 1] = [MapFormat(&ply::FORMAT)];
+
+/// What a format's file provides.
+struct FormatRow {
+    /// Name on the command line and in configurations.
+    name: &'static str,
+    /// Extension of its files, without the dot.
+    extension: &'static str,
+    /// One sentence for `--help`.
+    help: &'static str,
+    /// The file's bytes, the same ones for the same map.
+    encode: fn(&GaussianCloud) -> Result<Vec<u8>, ExportError>,
+    /// Reads a file; the path is named in errors.
+    decode: fn(&mut dyn BufRead, FileSize, &Path) -> Result<GaussianCloud, ExportError>,
 }
 
+/// Size of a file, bytes: headers that promise more are refused before memory is reserved.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct FileSize(pub u64);
+
+/// A file format of Gaussian maps.
+#[derive(Clone, Copy)]
+pub struct MapFormat(&'static FormatRow);
+
 impl MapFormat {
-    pub const ALL: [Self; 1] = [Self::Ply];
+    /// All formats; the first one is the default.
+    pub fn all() -> &'static [Self] {
+        &FORMATS
+    }
+
+    /// The format of that name.
+    pub fn by_name(name: &str) -> Option<Self> {
+        FORMATS.iter().copied().find(|format| format.name() == name)
+    }
+
+    /// The format of a file's extension, in any case.
+    pub fn of_path(path: &Path) -> Option<Self> {
+        let extension = path.extension()?.to_str()?;
+        FORMATS.iter().copied().find(|format| format.extension().eq_ignore_ascii_case(extension))
+    }
+
+    /// Name on the command line and in configurations.
+    pub fn name(self) -> &'static str {
+        self.0.name
+    }
 
     /// Extension of its files, without the dot.
     pub fn extension(self) -> &'static str {
-        match self {
-            Self::Ply => "ply",
-        }
+        self.0.extension
     }
 
-    /// The format a file's extension stands for.
-    pub fn of_path(path: &Path) -> Option<Self> {
-        let extension = path.extension()?.to_str()?;
-        Self::ALL.into_iter().find(|format| format.extension().eq_ignore_ascii_case(extension))
-    }
-
-    /// The file's bytes, the same ones for the same map.
+    /// Encodes a map; the same bytes for the same map.
+    ///
+    /// # Errors
+    /// If a value of the map is not finite.
     pub fn encode(self, cloud: &GaussianCloud) -> Result<Vec<u8>, ExportError> {
-        match self {
-            Self::Ply => ply::encode(cloud),
-        }
+        (self.0.encode)(cloud)
     }
 
     /// Encodes and writes a map; returns the bytes that were written, for their hash.
+    ///
+    /// # Errors
+    /// If a value of the map is not finite, or the file cannot be written.
     pub fn write(self, cloud: &GaussianCloud, path: &Path) -> Result<Vec<u8>, ExportError> {
         let bytes = self.encode(cloud)?;
         write_atomically(path, &bytes)?;
         Ok(bytes)
     }
 
+    /// Reads a map.
+    ///
+    /// # Errors
+    /// If the file cannot be read, is cut off, or holds a value that is not finite.
     pub fn read(self, path: &Path) -> Result<GaussianCloud, ExportError> {
-        match self {
-            Self::Ply => ply::read(path),
-        }
+        let read_error = |source| ExportError::Read { path: path.into(), source };
+        let file = File::open(path).map_err(read_error)?;
+        let size = FileSize(file.metadata().map_err(read_error)?.len());
+        (self.0.decode)(&mut BufReader::new(file), size, path)
+    }
+
+    /// Decodes a map from bytes, for the fuzz target.
+    ///
+    /// # Errors
+    /// As [`Self::read`].
+    pub fn decode(self, mut bytes: &[u8]) -> Result<GaussianCloud, ExportError> {
+        let size = FileSize(bytes.len() as u64);
+        (self.0.decode)(&mut bytes, size, Path::new("file"))
     }
 }
 
+impl Default for MapFormat {
+    fn default() -> Self {
+        FORMATS[0]
+    }
+}
+
+impl PartialEq for MapFormat {
+    fn eq(&self, other: &Self) -> bool {
+        self.name() == other.name()
+    }
+}
+
+impl Eq for MapFormat {}
+
+impl std::fmt::Debug for MapFormat {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+impl clap::ValueEnum for MapFormat {
+    fn value_variants<'a>() -> &'a [Self] {
+        &FORMATS
+    }
+
+    fn to_possible_value(&self) -> Option<PossibleValue> {
+        Some(PossibleValue::new(self.0.name).help(self.0.help))
+    }
+}
+
+impl Serialize for MapFormat {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.serialize_str(self.name())
+    }
+}
+
+impl<'de> Deserialize<'de> for MapFormat {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let name = String::deserialize(deserializer)?;
+        let known = || FORMATS.iter().map(|format| format.name()).collect::<Vec<_>>().join(", ");
+        Self::by_name(&name).ok_or_else(|| de::Error::custom(format!("there is no map format `{name}`; known are {}", known())))
+    }
+}
+
+/// A map that cannot be written or read.
 #[derive(Debug, thiserror::Error)]
 pub enum ExportError {
     #[error(transparent)]
@@ -102,7 +195,8 @@ mod tests {
     #[test]
     fn every_format_gives_back_what_it_took() {
         let folder = tempfile::tempdir().unwrap();
-        for format in MapFormat::ALL {
+        for &format in MapFormat::all() {
+            assert_eq!(MapFormat::by_name(format.name()), Some(format));
             for sh_degree in ShDegree::ALL {
                 let cloud = cloud(sh_degree, 20);
                 let path = folder.path().join("map").with_extension(format.extension());

@@ -4,13 +4,22 @@
 //! element is `vertex` with these properties as floats, in any order and with others between them.
 //! Left out: ASCII and big-endian files, and the compressed variants of some viewers.
 
-use std::io::{BufRead, BufReader, Read};
+use std::io::{BufRead, Read};
 use std::path::Path;
 
 use glam::{Quat, Vec3};
 
-use super::ExportError;
+use super::{ExportError, FileSize, FormatRow};
 use crate::splat::{Gaussian, GaussianCloud, ShDegree};
+
+/// The format's row in the table of formats.
+pub(super) const FORMAT: FormatRow = FormatRow {
+    name: "ply",
+    extension: "ply",
+    help: "PLY of the 3D Gaussian Splatting reference code, binary little endian; every viewer reads it.",
+    encode,
+    decode,
+};
 
 /// No honest header is longer; a file that has no line ends must not be read whole in search of one.
 const MAX_HEADER_BYTES: u64 = 1 << 16;
@@ -29,7 +38,7 @@ fn property_names(sh_degree: ShDegree) -> Vec<String> {
 }
 
 /// The whole file. The same bytes for the same map; rotations are written with unit length.
-pub fn encode(cloud: &GaussianCloud) -> Result<Vec<u8>, ExportError> {
+fn encode(cloud: &GaussianCloud) -> Result<Vec<u8>, ExportError> {
     if let Some(index) = cloud.first_non_finite() {
         return Err(ExportError::NonFinite { index });
     }
@@ -86,18 +95,10 @@ struct VertexLayout {
     more_elements: bool,
 }
 
-/// Reads a 3DGS PLY, ours or another system's. Nothing is allocated for Gaussians that the file is too short to hold.
-pub fn read(path: &Path) -> Result<GaussianCloud, ExportError> {
+/// Reads a map from a reader of `size` bytes; `path` is named in errors.
+fn decode(reader: &mut dyn BufRead, FileSize(file_bytes): FileSize, path: &Path) -> Result<GaussianCloud, ExportError> {
     let read_error = |source| ExportError::Read { path: path.into(), source };
-    let file = std::fs::File::open(path).map_err(read_error)?;
-    let file_bytes = file.metadata().map_err(read_error)?.len();
-    read_from(BufReader::new(file), file_bytes, path)
-}
-
-/// The same from a reader of `file_bytes` bytes; `path` is named in errors.
-pub fn read_from(mut reader: impl BufRead, file_bytes: u64, path: &Path) -> Result<GaussianCloud, ExportError> {
-    let read_error = |source| ExportError::Read { path: path.into(), source };
-    let (lines, header_bytes) = header_lines(&mut reader, path)?;
+    let (lines, header_bytes) = header_lines(reader, path)?;
     let layout = parse_header(&lines, path)?;
 
     let found = file_bytes.saturating_sub(header_bytes);
@@ -143,7 +144,7 @@ fn gaussian_from_values(values: &[f32]) -> Gaussian {
 }
 
 /// The header's lines up to `end_header`, and how many bytes they took.
-fn header_lines(reader: &mut impl BufRead, path: &Path) -> Result<(Vec<String>, u64), ExportError> {
+fn header_lines(reader: &mut dyn BufRead, path: &Path) -> Result<(Vec<String>, u64), ExportError> {
     let mut limited = reader.take(MAX_HEADER_BYTES);
     let mut lines: Vec<String> = Vec::new();
     loop {

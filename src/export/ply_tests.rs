@@ -7,7 +7,7 @@ fn read_bytes(bytes: &[u8]) -> Result<GaussianCloud, ExportError> {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("map.ply");
     std::fs::write(&path, bytes).unwrap();
-    read(&path)
+    crate::export::MapFormat::default().read(&path)
 }
 
 fn refusal(bytes: &[u8]) -> String {

@@ -25,8 +25,6 @@ use crate::splat::GaussianCloud;
 pub const TRAJECTORY: &str = "trajectory.txt";
 /// Poses of the keyframes, TUM format.
 pub const KEYFRAMES: &str = "keyframes.txt";
-/// The Gaussian map.
-pub const MAP: &str = "map.ply";
 /// Accuracy, times and memory.
 pub const METRICS: &str = "metrics.json";
 /// The resolved configuration.
@@ -108,6 +106,17 @@ pub fn prepare_folder(out: &Path) -> Result<FolderLock, OutputError> {
     Ok(lock)
 }
 
+/// File name of a map.
+pub fn map_name(format: MapFormat) -> String {
+    format!("map.{}", format.extension())
+}
+
+/// The map in a run's folder and its format, if there is one.
+pub fn find_map(folder: &Path) -> Option<(PathBuf, MapFormat)> {
+    let in_folder = |format: &MapFormat| (folder.join(map_name(*format)), *format);
+    MapFormat::all().iter().map(in_folder).find(|(path, _)| path.is_file())
+}
+
 /// Removes the checkpoint of a finished run.
 ///
 /// # Errors
@@ -157,7 +166,11 @@ pub fn write_results(out: &Path, recording: &Recording, result: &RunResult) -> R
     if recording.config().mapping.exposure.enabled {
         write_records(&out.join(EXPOSURES), &result.exposures())?;
     }
-    let bytes = MapFormat::Ply.write(&result.cloud, &out.join(MAP))?;
+    for format in MapFormat::all() {
+        remove_file(&out.join(map_name(*format)))?;
+    }
+    let format = recording.config().map_format;
+    let bytes = format.write(&result.cloud, &out.join(map_name(format)))?;
     Ok(WrittenMap { bytes: bytes.len() as u64, hash: sha256_hex(&bytes) })
 }
 

@@ -27,30 +27,31 @@ pub struct EvaluateOptions {
     pub adapter: Option<String>,
 }
 
-/// Measures a folder with `trajectory.txt` and `map.ply` against its recording, and writes `metrics.json`, `comparison.json` and held-out views
+/// Measures a folder with `trajectory.txt` and a map against its recording, and writes `metrics.json`, `comparison.json` and held-out views
 /// there. Figures that only the run itself knows are kept from an earlier `metrics.json`. `on_view` receives the number of compared views.
 ///
 /// # Errors
 /// If a file is missing or does not parse, the recording cannot be opened, no pose is near a frame, or a result cannot be written.
 pub fn evaluate_folder(folder: &Path, options: &EvaluateOptions, on_view: &dyn Fn(usize)) -> Result<Metrics, SessionError> {
-    for name in [outputs::TRAJECTORY, outputs::MAP] {
-        let path = folder.join(name);
-        if !path.is_file() {
-            return Err(SessionError::Missing { path, advice: "give a run's folder, with trajectory.txt and map.ply" });
-        }
+    let missing =
+        |path| SessionError::Missing { path, advice: "give a run's folder, with trajectory.txt and a map, like map.ply" };
+    let trajectory_file = folder.join(outputs::TRAJECTORY);
+    if !trajectory_file.is_file() {
+        return Err(missing(trajectory_file));
     }
+    let found = outputs::find_map(folder);
+    let (map_file, format) = found.ok_or_else(|| missing(folder.join(outputs::map_name(MapFormat::default()))))?;
     let recording = Recording::open(resolve(folder, options)?)?;
     let sequence = recording.sequence();
     let earlier = earlier_metrics(folder)?;
-    let trajectory = read_trajectory(&folder.join(outputs::TRAJECTORY))?;
+    let trajectory = read_trajectory(&trajectory_file)?;
     let keyframes_file = folder.join(outputs::KEYFRAMES);
     let keyframes = if keyframes_file.is_file() { read_trajectory(&keyframes_file)? } else { Trajectory::default() };
-    let map_file = folder.join(outputs::MAP);
-    let cloud = MapFormat::Ply.read(&map_file).map_err(OutputError::from)?;
+    let cloud = format.read(&map_file).map_err(OutputError::from)?;
     let map_bytes = std::fs::read(&map_file).map_err(|error| unreadable(&map_file, format!("cannot be read: {error}")))?;
     let poses = nearest_frames(sequence, &trajectory);
     if poses.is_empty() {
-        let (trajectory, recording) = (folder.join(outputs::TRAJECTORY), sequence.name.clone());
+        let (trajectory, recording) = (trajectory_file, sequence.name.clone());
         return Err(SessionError::NoPoseNearFrames { trajectory, seconds: MAX_TIME_DIFFERENCE_S, recording });
     }
     let gpu = Gpu::open(recording.config().adapter.as_deref())?;

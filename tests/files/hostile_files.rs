@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use fastrand::Rng;
 use keysplat::config::Config;
-use keysplat::export::ply;
+use keysplat::export::MapFormat;
 use keysplat::geometry::Trajectory;
 use keysplat::sequence::Layout;
 use keysplat::synthetic::SceneConfig;
@@ -46,9 +46,11 @@ const DAMAGED_EACH: usize = 400;
 fn parse(target: &str, bytes: &[u8]) -> usize {
     let path = Path::new("file");
     let text = || std::str::from_utf8(bytes).ok();
+    if let Some(format) = MapFormat::by_name(target) {
+        return usize::from(format.decode(bytes).is_ok());
+    }
     match (Layout::by_name(target), target) {
         (Some(layout), _) => layout.parse_files(bytes).iter().filter(|result| result.is_ok()).count(),
-        (_, "ply") => usize::from(ply::read_from(bytes, bytes.len() as u64, path).is_ok()),
         (_, "trajectory") => usize::from(text().is_some_and(|text| Trajectory::parse_tum(text, path).is_ok())),
         (_, "config") => usize::from(text().is_some_and(|text| Config::parse(text, path, false).is_ok())),
         (_, "scene") => usize::from(text().is_some_and(|text| SceneConfig::parse(text, path).is_ok())),
@@ -68,10 +70,11 @@ fn corpus() -> Vec<(String, PathBuf, Vec<u8>)> {
         let target = folder.file_name().unwrap().to_str().unwrap().to_owned();
         entries(&folder).into_iter().map(move |file| (target.clone(), file.clone(), std::fs::read(file).unwrap()))
     };
-    // One target has all layouts, a folder each.
-    let (layouts, targets): (Vec<_>, Vec<_>) = entries(&root).into_iter().partition(|folder| folder.ends_with("layouts"));
-    let layouts = layouts.iter().flat_map(|folder| entries(folder));
-    targets.into_iter().chain(layouts).flat_map(of_target).collect()
+    // One target has all layouts and one all formats, a folder each.
+    let (tables, targets): (Vec<_>, Vec<_>) =
+        entries(&root).into_iter().partition(|folder| folder.ends_with("layouts") || folder.ends_with("formats"));
+    let rows = tables.iter().flat_map(|folder| entries(folder));
+    targets.into_iter().chain(rows).flat_map(of_target).collect()
 }
 
 /// A copy with some bytes changed, lost, doubled, or replaced by numbers that lie.
@@ -106,6 +109,10 @@ fn the_corpus_is_read_and_its_damaged_copies_do_no_harm() {
     assert!(
         Layout::all().iter().all(|layout| corpus.iter().any(|(target, ..)| target == layout.name())),
         "fuzz/corpus/layouts lacks a folder for a layout"
+    );
+    assert!(
+        MapFormat::all().iter().all(|format| corpus.iter().any(|(target, ..)| target == format.name())),
+        "fuzz/corpus/formats lacks a folder for a format"
     );
     for (target, file, bytes) in corpus {
         assert!(parse(&target, &bytes) > 0, "{} is read by no parser", file.display());

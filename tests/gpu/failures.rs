@@ -32,7 +32,7 @@ fn assert_written(name: &str, recording: &Recording, Replay { result, .. }: &Rep
     let out = scratch().join(name);
     let _lock = outputs::prepare_folder(&out).unwrap();
     outputs::write_results(&out, recording, result).unwrap();
-    assert_eq!(MapFormat::Ply.read(&out.join(outputs::MAP)).unwrap().len(), result.cloud.len());
+    assert_eq!(MapFormat::default().read(&out.join(outputs::map_name(MapFormat::default()))).unwrap().len(), result.cloud.len());
 }
 
 #[test]

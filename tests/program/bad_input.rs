@@ -244,7 +244,7 @@ fn folders_to_evaluate() {
     std::fs::write(&trajectory, "100.0 0 0 0 0 0 0 1\n").unwrap();
     eval(&dir, &with_sequence).refused(&[dir.join("map.ply").to_str().unwrap(), "3DGS PLY"]);
     let empty = keysplat::splat::GaussianCloud::new(Default::default());
-    keysplat::export::MapFormat::Ply.write(&empty, &dir.join("map.ply")).unwrap();
+    keysplat::export::MapFormat::default().write(&empty, &dir.join("map.ply")).unwrap();
     eval(&dir, &with_sequence).refused(&["no pose of", trajectory.to_str().unwrap(), "within 0.02 s", "--sequence"]);
     std::fs::write(dir.join("metrics.json"), "{}").unwrap();
     eval(&dir, &with_sequence).refused(&[dir.join("metrics.json").to_str().unwrap(), "move it away"]);

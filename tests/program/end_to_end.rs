@@ -135,7 +135,7 @@ fn figures_are_true_of_what_was_written() {
     assert_plausible(m.images.monogs, (0..FRAMES).filter(|index| index % 5 == 0 && !keyframes.contains(index)).count());
 
     let map = read(out.join("map.ply"));
-    let cloud = MapFormat::Ply.read(&out.join("map.ply")).unwrap();
+    let cloud = MapFormat::default().read(&out.join("map.ply")).unwrap();
     assert_eq!((m.map_bytes, m.map_hash), (Some(map.len() as u64), Some(sha256(&map))));
     assert_eq!(m.gaussians, Some(cloud.len() as u64));
     assert!(cloud.len() > 1000 && cloud.first_non_finite().is_none());

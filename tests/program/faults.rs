@@ -43,7 +43,7 @@ impl Run {
         let out = scratch().join(format!("{name}-out"));
         let said = finish(run_command(&copy, &out, more)).succeeded();
         assert!(!said.stderr.contains("panicked"), "{}", said.stderr);
-        let cloud = MapFormat::Ply.read(&out.join("map.ply")).unwrap();
+        let cloud = MapFormat::default().read(&out.join("map.ply")).unwrap();
         assert!(cloud.first_non_finite().is_none());
         Trajectory::read_tum(&out.join("trajectory.txt")).unwrap();
         let all: Vec<String> = (0..FRAMES).map(stamp).collect();

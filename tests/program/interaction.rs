@@ -118,7 +118,7 @@ mod interrupted {
         assert_eq!((m.frames, m.frames_tracked), (FRAMES as u64, tracked as u64));
         assert!(m.mapping.unwrap().iterations < STEPS);
         assert!(m.images.all_frames.unwrap().psnr_db.unwrap() > 15.0);
-        assert!(MapFormat::Ply.read(&out.join("map.ply")).unwrap().len() > 1000);
+        assert!(MapFormat::default().read(&out.join("map.ply")).unwrap().len() > 1000);
         assert!(finished.stdout.contains("lost frames"));
     }
 }

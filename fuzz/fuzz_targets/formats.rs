@@ -1,0 +1,15 @@
+//! Maps in all file formats. A map that was read is finite; written and read again it is the same file.
+#![no_main]
+
+use keysplat::export::MapFormat;
+use libfuzzer_sys::fuzz_target;
+
+fuzz_target!(|bytes: &[u8]| {
+    for format in MapFormat::all() {
+        if let Ok(cloud) = format.decode(bytes) {
+            let once = format.encode(&cloud).expect("a map that was read is finite");
+            let again = format.decode(&once).expect("a map that was written is valid");
+            assert_eq!(format.encode(&again).expect("it is finite"), once);
+        }
+    }
+});
