@@ -27,7 +27,7 @@ pub(super) const LAYOUT: LayoutRow = LayoutRow {
     marker: "mav0/cam0",
     help: "`mav0/cam0` and optionally `mav0/cam1`, each with `data.csv`, `sensor.yaml` and `data`.",
     is_photos: false,
-    recognise: recognise,
+    recognise,
     open: |folder, _| open(folder),
     parse: |bytes| {
         parse_text(bytes, |text, path| {

@@ -59,7 +59,7 @@ pub(super) const LAYOUT: LayoutRow = LayoutRow {
     marker: "camera.toml",
     help: "`camera.toml` and images in the folder itself, in `rgb` and optionally `depth`, or in `left` and `right`.",
     is_photos: false,
-    recognise: recognise,
+    recognise,
     open: |folder, _| open(folder),
     parse: |bytes| parse_text(bytes, |text, path| vec![parse_camera(text, path).map(drop)]),
 };

@@ -26,7 +26,7 @@ pub(super) const LAYOUT: LayoutRow = LayoutRow {
     marker: "transforms.json",
     help: "`transforms.json` of NeRF, instant-ngp and nerfstudio: photos with known poses.",
     is_photos: true,
-    recognise: recognise,
+    recognise,
     open: |folder, _| open(folder),
     parse: |bytes| {
         parse_text(bytes, |text, path| {

@@ -27,7 +27,7 @@ pub(super) const LAYOUT: LayoutRow = LayoutRow {
     help: "`rgb.txt`, `depth.txt`, `groundtruth.txt`, and `camera.txt` or a folder name that names a TUM camera.",
     is_photos: false,
     recognise: |folder| folder.join("rgb.txt").is_file(),
-    open: open,
+    open,
     parse: |bytes| parse_text(bytes, |text, path| vec![parse_list(text, path).map(drop), parse_camera(text, path).map(drop)]),
 };
 

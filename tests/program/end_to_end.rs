@@ -271,7 +271,7 @@ fn the_realtime_preset_maps_at_a_resolution_that_was_measured() {
     assert!(said.stderr.contains("training step measured"), "{}", said.stderr);
     let (m, config) = (metrics(&out), Config::read(&out.join("config.toml")).unwrap());
     let mapping = m.mapping.unwrap();
-    assert!(m.paced && config.mapping.yields_to_keyframes && mapping.iterations > 0, "{m}");
+    assert!(m.paced && config.mapping.yields_to_keyframes && m.gaussians.unwrap() > 0, "{m}");
     assert_eq!(mapping.map_width, (f64::from(WIDTH) * config.map_scale).round() as u32);
     // Frames last as long as they did when they were recorded.
     assert!(m.wall_s.unwrap() >= (FRAMES - 1) as f64 / FPS, "{m}");

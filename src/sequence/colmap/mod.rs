@@ -66,9 +66,9 @@ pub(super) const LAYOUT: LayoutRow = LayoutRow {
     marker: "images and sparse/0",
     help: "`images` and COLMAP's model of them in `sparse/0`, binary or text: photos with known poses.",
     is_photos: true,
-    recognise: recognise,
+    recognise,
     open: |folder, _| open(folder),
-    parse: parse,
+    parse,
 };
 
 fn recognise(folder: &Path) -> bool {

@@ -36,8 +36,8 @@ pub(super) const LAYOUT: LayoutRow = LayoutRow {
     marker: "camera.toml and a video",
     help: "A video file with its `camera.toml` beside it, or a folder with these two alone.",
     is_photos: false,
-    recognise: recognise,
-    open: open,
+    recognise,
+    open,
     parse: |bytes| {
         let io = |source| SequenceError::Read { path: Path::new("file").into(), source };
         let is_cut = |container: Container| container.is_cut(Cursor::new(bytes)).map_err(io);
