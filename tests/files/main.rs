@@ -4,6 +4,7 @@
 mod common;
 
 mod architecture;
+mod documents;
 mod hostile_files;
 mod layouts;
 mod scikit_image;
