@@ -31,7 +31,7 @@ pub fn draw_trajectory(truth: &Trajectory, estimate: &Trajectory, errors: &Traje
     let mut svg = String::new();
     {
         let root = SVGBackend::with_string(&mut svg, SIZE).into_drawing_area();
-        draw(&root, (&real, &aligned), &over_time, errors.ate_rmse_m).map_err(|e| e.to_string())?;
+        draw(&root, &real, &aligned, &over_time, errors.ate_rmse_m).map_err(|e| e.to_string())?;
     }
     Ok(svg)
 }
@@ -39,7 +39,7 @@ pub fn draw_trajectory(truth: &Trajectory, estimate: &Trajectory, errors: &Traje
 type Drawn = Result<(), Box<dyn std::error::Error>>;
 type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
 
-fn draw(root: &Area<'_>, (truth, estimate): (&[[f64; 3]], &[[f64; 3]]), errors: &[(f64, f64)], ate_metres: f64) -> Drawn {
+fn draw(root: &Area<'_>, truth: &[[f64; 3]], estimate: &[[f64; 3]], errors: &[(f64, f64)], ate_metres: f64) -> Drawn {
     root.fill(&WHITE)?;
     let (above, below) = root.split_vertically(PATH_HEIGHT);
     draw_paths(&above, truth, estimate)?;

@@ -42,6 +42,14 @@ pub fn workgroups(count: u32) -> [u32; 3] {
     [count.min(MAX_PER_DIMENSION), count.div_ceil(MAX_PER_DIMENSION).max(1), 1]
 }
 
+/// A number of workgroups along x, y and z, three u32 in a buffer.
+#[derive(Clone, Copy)]
+pub struct IndirectSize<'a> {
+    pub buffer: &'a GpuBuffer,
+    /// Bytes from the buffer's start.
+    pub offset: u64,
+}
+
 impl Kernel {
     /// Compiles `entry_point` of a WGSL `source`.
     pub fn new(gpu: &Gpu, label: &'static str, entry_point: &str, source: &str) -> Self {
@@ -95,17 +103,17 @@ impl Kernel {
         pass.dispatch_workgroups(size[0], size[1], size[2]);
     }
 
-    /// Runs with the size that lies in `arguments` at `offset` bytes.
+    /// Runs with a size that the GPU has computed.
     pub fn dispatch_indirect(
         &self,
         gpu: &Gpu,
         pass: &mut wgpu::ComputePass<'_>,
         bindings: &[(u32, &GpuBuffer)],
-        (arguments, offset): (&GpuBuffer, u64),
+        size: IndirectSize<'_>,
     ) {
         pass.set_pipeline(&self.pipeline);
         pass.set_bind_group(0, &self.bind(gpu, bindings), &[]);
         gpu.mark(pass, self.label);
-        pass.dispatch_workgroups_indirect(arguments.raw(), offset);
+        pass.dispatch_workgroups_indirect(size.buffer.raw(), size.offset);
     }
 }

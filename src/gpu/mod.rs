@@ -8,4 +8,4 @@ mod profile;
 
 pub use buffer::GpuBuffer;
 pub use device::{AdapterSummary, Gpu, GpuError, adapters};
-pub use kernel::{Kernel, workgroups};
+pub use kernel::{IndirectSize, Kernel, workgroups};

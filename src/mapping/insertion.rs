@@ -43,7 +43,7 @@ pub(super) fn gaussians(
                 || missed.as_ref().is_some_and(|m| m.response(block) > config.missed_detail))
         {
             let slope = slope(&filled, (width, height), center, block.size);
-            cloud.push(gaussian(keyframe, center, (metres, slope), block.size, config));
+            cloud.push(gaussian(keyframe, &SurfacePoint { x: center.0, y: center.1, metres, slope }, block.size, config));
         }
     }
     cloud
@@ -68,14 +68,19 @@ fn slope(filled: &[f32], (width, height): (u32, u32), (x, y): (u32, u32), stride
     [along(at(left, y), at(x, y), at(right, y), right - left), along(at(x, top), at(x, y), at(x, bottom), bottom - top)]
 }
 
+/// The surface at a pixel.
+struct SurfacePoint {
+    x: u32,
+    y: u32,
+    /// Depth along z.
+    metres: f32,
+    /// ∂depth/∂(x, y) relative to the depth, 1/pixels.
+    slope: [f32; 2],
+}
+
 /// A disc on the surface, as large as its block of pixels there.
-fn gaussian(
-    keyframe: &Keyframe,
-    (x, y): (u32, u32),
-    (metres, slope): (f32, [f32; 2]),
-    stride: u32,
-    config: &InsertionConfig,
-) -> Gaussian {
+fn gaussian(keyframe: &Keyframe, point: &SurfacePoint, stride: u32, config: &InsertionConfig) -> Gaussian {
+    let SurfacePoint { x, y, metres, slope } = *point;
     let pinhole = &keyframe.image.pinhole;
     let ray = pinhole.unproject(&Vector2::new(f64::from(x), f64::from(y)), 1.0);
     let p_in_world = keyframe.world_from_camera * Point3::from(ray * f64::from(metres));

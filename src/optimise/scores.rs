@@ -1,7 +1,7 @@
 //! Scores of the Gaussians over some views, for density control: computed beside a training step, from its own tile lists and gradients.
 
 use super::LossConfig;
-use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel};
+use crate::gpu::{Gpu, GpuBuffer, GpuError, IndirectSize, Kernel};
 use crate::render::layout::{Counter, ScoreSetup, VISIBLE_COUNTER};
 use crate::render::{GpuCloud, PreparedView, Rasterizer, shaders};
 
@@ -130,7 +130,7 @@ impl Scores {
             (6, &self.setup),
             (7, image.loss_total),
         ];
-        let visible = (&ws.counters, Counter::per_element_offset(VISIBLE_COUNTER));
+        let visible = IndirectSize { buffer: &ws.counters, offset: Counter::per_element_offset(VISIBLE_COUNTER) };
         self.gather.dispatch_indirect(gpu, pass, &gather, visible);
     }
 

@@ -190,7 +190,7 @@ impl Trainer {
                 self.adam.write(&gpu, 0, &[adam.setup(self.steps, *lr_scale)]);
                 self.steps += 1;
                 let mut encoder = gpu.device.create_command_encoder(&Default::default());
-                self.encode(&mut encoder, cloud, (camera, [0.0; 3]), &objective, &Sink::Adam)?;
+                self.encode(&mut encoder, cloud, &Viewpoint { camera, background: [0.0; 3] }, &objective, &Sink::Adam)?;
                 self.encode_log(&mut encoder, &log, entry);
                 gpu.queue.submit([encoder.finish()]);
                 self.encode_time += started.elapsed();
@@ -299,7 +299,7 @@ impl Trainer {
     ) -> Result<Gradients, GpuError> {
         let gpu = self.rasterizer.gpu().clone();
         let sink = GpuBuffer::storage(&gpu, "gradients", cloud.parameters().raw().size())?;
-        self.run(cloud, (camera, background), objective, &Sink::Gradient(&sink))?;
+        self.run(cloud, &Viewpoint { camera, background }, objective, &Sink::Gradient(&sink))?;
         let planes = (0..cloud.planes())
             .map(|plane| sink.read(&gpu, plane * cloud.capacity(), cloud.len()))
             .collect::<Result<Vec<_>, _>>()?;
@@ -312,14 +312,14 @@ impl Trainer {
     fn run(
         &mut self,
         cloud: &GpuCloud,
-        view: (&ViewCamera, [f32; 3]),
+        viewpoint: &Viewpoint<'_>,
         objective: &Objective<'_>,
         sink: &Sink<'_>,
     ) -> Result<(), GpuError> {
         let gpu = self.rasterizer.gpu().clone();
         loop {
             let mut encoder = gpu.device.create_command_encoder(&Default::default());
-            self.encode(&mut encoder, cloud, view, objective, sink)?;
+            self.encode(&mut encoder, cloud, viewpoint, objective, sink)?;
             gpu.queue.submit([encoder.finish()]);
             if self.rasterizer.finish()?.is_some() {
                 return Ok(());
@@ -332,12 +332,12 @@ impl Trainer {
         &mut self,
         encoder: &mut wgpu::CommandEncoder,
         cloud: &GpuCloud,
-        (camera, background): (&ViewCamera, [f32; 3]),
+        viewpoint: &Viewpoint<'_>,
         objective: &Objective<'_>,
         sink: &Sink<'_>,
     ) -> Result<(), GpuError> {
         let gpu = self.rasterizer.gpu().clone();
-        let prepared = self.rasterizer.prepare(cloud, camera, background)?;
+        let prepared = self.rasterizer.prepare(cloud, viewpoint.camera, viewpoint.background)?;
         self.reserve(&gpu, &prepared.view, cloud)?;
         self.rasterizer.encode_clear(encoder);
         if let Objective::Image { target, .. } = objective {
@@ -376,6 +376,12 @@ impl Trainer {
         image_buffers::choose(&mut self.images, gpu, (view.width, view.height))?;
         self.reserve_gaussians(gpu, cloud.capacity())
     }
+}
+
+/// A camera and the colour behind the map, linear RGB.
+struct Viewpoint<'a> {
+    camera: &'a ViewCamera,
+    background: [f32; 3],
 }
 
 fn copy(encoder: &mut wgpu::CommandEncoder, from: &GpuBuffer, to: &GpuBuffer) {

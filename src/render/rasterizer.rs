@@ -12,7 +12,7 @@ use super::layout::{BlendForm, COUNTERS, Counter, INTERSECTION_COUNTER, ScanSetu
 use super::shaders;
 use super::sort::{Scan, ScanJob, Sort, SortJob};
 use super::workspace::{Capacities, Workspace};
-use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, workgroups};
+use crate::gpu::{Gpu, GpuBuffer, GpuError, IndirectSize, Kernel, workgroups};
 use crate::splat::{Exposure, ViewCamera};
 
 /// Depth keys are whole f32.
@@ -232,7 +232,7 @@ impl Rasterizer {
     /// Tile lists: count, offsets, emit, stable sort by tile, ranges, order.
     fn encode_tiles(&self, pass: &mut wgpu::ComputePass<'_>, prepared: &PreparedView) {
         let (gpu, ws, k) = (&*self.gpu, &self.workspace, &self.kernels);
-        let visible = (&ws.counters, Counter::per_element_offset(VISIBLE_COUNTER));
+        let visible = IndirectSize { buffer: &ws.counters, offset: Counter::per_element_offset(VISIBLE_COUNTER) };
         let lists = |mode| {
             [
                 (0, &self.view),
@@ -259,7 +259,8 @@ impl Rasterizer {
         let sorted = k.sort.encode(gpu, pass, ws, &by_tile);
         debug_assert_eq!(sorted, prepared.sorted);
         let ranges = [(0, &ws.counters), (1, &ws.tile_keys[sorted]), (2, &ws.ranges)];
-        k.tile_ranges.dispatch_indirect(gpu, pass, &ranges, (&ws.counters, Counter::per_element_offset(INTERSECTION_COUNTER)));
+        let intersections = IndirectSize { buffer: &ws.counters, offset: Counter::per_element_offset(INTERSECTION_COUNTER) };
+        k.tile_ranges.dispatch_indirect(gpu, pass, &ranges, intersections);
         k.order_tiles.dispatch(gpu, pass, &[(0, &self.view), (1, &ws.ranges)], [1, 1, 1]);
     }
 

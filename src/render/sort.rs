@@ -3,7 +3,7 @@
 use super::layout::{BlendForm, COUNTERS, Counter, SCAN_BLOCK, SORT_BLOCK, SORT_CHUNK, ScanSetup, SortSetup};
 use super::shaders;
 use super::workspace::Workspace;
-use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, workgroups};
+use crate::gpu::{Gpu, GpuBuffer, GpuError, IndirectSize, Kernel, workgroups};
 
 /// `counter_in` of a scan whose length the host knows.
 const NO_COUNTER: u32 = u32::MAX;
@@ -95,7 +95,7 @@ impl Sort {
     /// Sorts `keys[0]` and `values[0]` stably by the keys' low bits; returns which of the two buffers of each holds the result.
     pub fn encode(&self, gpu: &Gpu, pass: &mut wgpu::ComputePass<'_>, ws: &Workspace, job: &SortJob<'_>) -> usize {
         let SortJob { keys, values, counter, bits } = *job;
-        let arguments = (&ws.counters, Counter::per_block_offset(counter));
+        let arguments = IndirectSize { buffer: &ws.counters, offset: Counter::per_block_offset(counter) };
         let chunks = (keys[0].raw().size() as u32 / 4).div_ceil(SORT_BLOCK * SORT_CHUNK);
         let passes = bits.div_ceil(DIGIT_BITS);
         for digit in 0..passes {

@@ -83,8 +83,8 @@ fn plots_of(run: &Run) -> Result<String, String> {
             )
         };
         let [first, second, third] = plots::axes_by_extent(comparison);
-        add(&format!("The path from where it is widest{colored}"), plots::path(comparison, (first, second), worst)?);
-        add("The same from the side", plots::path(comparison, (first, third), worst)?);
+        add(&format!("The path from where it is widest{colored}"), plots::path(comparison, first, second, worst)?);
+        add("The same from the side", plots::path(comparison, first, third, worst)?);
         if worst > 0.0 {
             add("Distance from the truth, after alignment", plots::error_over_time(comparison)?);
         }

@@ -55,7 +55,7 @@ fn around(values: impl Iterator<Item = f64> + Clone) -> Range<f64> {
 
 /// Lines over a common axis; each with its colour.
 fn lines(
-    (x_name, y_name): (&str, &str),
+    [x_name, y_name]: [&str; 2],
     range: Range<f64>,
     series: &[(&[(f64, f64)], RGBColor)],
     dots: bool,
@@ -94,7 +94,7 @@ pub fn color_of(share: f64) -> RGBColor {
 }
 
 /// The path along axes `(across, up)`, its colour the error, from one frame with truth to the next; the truth in grey.
-pub fn path(comparison: &Comparison, (across, up): (usize, usize), worst_m: f64) -> Result<String, String> {
+pub fn path(comparison: &Comparison, across: usize, up: usize, worst_m: f64) -> Result<String, String> {
     const NAMES: [&str; 3] = ["x, metres", "y, metres", "z, metres"];
     let positions: Vec<[f64; 3]> = comparison.poses.iter().map(|p| p.position).collect();
     let extent = |axis: usize| around(positions.iter().chain(&comparison.truth).map(move |p| p[axis]));
@@ -137,31 +137,31 @@ pub fn error_over_time(comparison: &Comparison) -> Result<String, String> {
     let start = comparison.poses.first().map_or(0.0, |p| p.timestamp_s);
     let points: Vec<(f64, f64)> =
         comparison.poses.iter().filter_map(|p| Some((p.timestamp_s - start, 100.0 * p.error_m?))).collect();
-    lines(("seconds", "error, cm"), from_zero(points.iter().map(|p| p.1)), &[(&points, LINE)], false)
+    lines(["seconds", "error, cm"], from_zero(points.iter().map(|p| p.1)), &[(&points, LINE)], false)
 }
 
 /// PSNR of the held-out views over their frames.
 pub fn view_quality(comparison: &Comparison) -> Result<String, String> {
     let points: Vec<(f64, f64)> = comparison.views.iter().filter_map(|v| Some((v.frame as f64, v.psnr_db?))).collect();
-    lines(("frame", "PSNR, dB"), around(points.iter().map(|p| p.1)), &[(&points, LINE)], true)
+    lines(["frame", "PSNR, dB"], around(points.iter().map(|p| p.1)), &[(&points, LINE)], true)
 }
 
 /// PSNR of the mapper's own views over its keyframes.
 pub fn keyframe_quality(keyframes: &[KeyframeRecord]) -> Result<String, String> {
     let points: Vec<(f64, f64)> = numbered(keyframes, |k| f64::from(k.report.psnr_db));
-    lines(("keyframe", "PSNR, dB"), around(points.iter().map(|p| p.1)), &[(&points, LINE)], true)
+    lines(["keyframe", "PSNR, dB"], around(points.iter().map(|p| p.1)), &[(&points, LINE)], true)
 }
 
 /// Thousands of Gaussians over the seconds.
 pub fn gaussians(keyframes: &[KeyframeRecord]) -> Result<String, String> {
     let points: Vec<(f64, f64)> = keyframes.iter().map(|k| (k.done_s, k.report.gaussians as f64 / 1e3)).collect();
-    lines(("seconds", "Gaussians, thousand"), from_zero(points.iter().map(|p| p.1)), &[(&points, LINE)], true)
+    lines(["seconds", "Gaussians, thousand"], from_zero(points.iter().map(|p| p.1)), &[(&points, LINE)], true)
 }
 
 /// Resident megabytes over the seconds.
 pub fn memory(keyframes: &[KeyframeRecord]) -> Result<String, String> {
     let points: Vec<(f64, f64)> = keyframes.iter().filter_map(|k| Some((k.done_s, k.host_bytes? as f64 / 1e6))).collect();
-    lines(("seconds", "MB"), from_zero(points.iter().map(|p| p.1)), &[(&points, LINE)], true)
+    lines(["seconds", "MB"], from_zero(points.iter().map(|p| p.1)), &[(&points, LINE)], true)
 }
 
 /// Seconds that each keyframe took the mapper, and messages that waited meanwhile.
@@ -169,7 +169,7 @@ pub fn mapper_load(keyframes: &[KeyframeRecord]) -> Result<String, String> {
     let busy = numbered(keyframes, |k| k.busy_s);
     let waiting = numbered(keyframes, |k| k.waiting as f64);
     let range = from_zero(busy.iter().chain(&waiting).map(|p| p.1));
-    lines(("keyframe", "seconds; messages"), range, &[(&busy, LINE), (&waiting, SECOND)], false)
+    lines(["keyframe", "seconds; messages"], range, &[(&busy, LINE), (&waiting, SECOND)], false)
 }
 
 fn numbered(keyframes: &[KeyframeRecord], value: impl Fn(&KeyframeRecord) -> f64) -> Vec<(f64, f64)> {
@@ -247,6 +247,6 @@ mod tests {
     fn nothing_to_draw_is_drawn_too() {
         assert!(stage_times(&[]).unwrap().starts_with("<svg"));
         assert!(gaussians(&[]).unwrap().starts_with("<svg"));
-        assert!(path(&Comparison::default(), (0, 1), 0.0).unwrap().starts_with("<svg"));
+        assert!(path(&Comparison::default(), 0, 1, 0.0).unwrap().starts_with("<svg"));
     }
 }

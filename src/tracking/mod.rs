@@ -15,6 +15,7 @@ pub(crate) mod initialisation;
 mod localisation;
 mod loop_closing;
 pub(crate) mod map;
+mod rig;
 pub(crate) mod solvers;
 mod tracker;
 

@@ -23,7 +23,7 @@ const ALLOWED: [(&str, &[&str]); 22] = [
     ("mapping", &["geometry", "sequence", "splat", "gpu", "render", "optimise"]),
     ("export", &["files", "geometry", "splat"]),
     ("evaluation", &["files", "geometry", "sequence", "splat", "gpu", "render"]),
-    ("config", &["sequence", "tracking", "mapping"]),
+    ("config", &["sequence", "tracking", "mapping", "export"]),
     ("recording", &["geometry", "sequence", "evaluation", "config"]),
     ("presets", &["gpu", "render", "bench", "config", "recording"]),
     (

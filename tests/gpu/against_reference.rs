@@ -10,7 +10,7 @@ use keysplat::optimise::{AdamConfig, ImageGradients, LossConfig, TargetImage, Tr
 use keysplat::render::{BlendForm, GpuCloud, Rasterizer};
 use keysplat::splat::ViewCamera;
 use keysplat::splat::{GaussianCloud, ShDegree};
-use keysplat::verification::reference::adam::Adam64;
+use keysplat::verification::reference::adam::{Adam64, Decay64};
 use keysplat::verification::reference::loss::{LossWeights, Target64, loss};
 use keysplat::verification::reference::project_backward::backward;
 use keysplat::verification::reference::{Cutoffs, Gaussian64, Image64, View64, cloud64, rasterize_forward};
@@ -174,7 +174,7 @@ fn adam_steps_agree() {
             let pace = (1.0 + f64::from(states[i].steps + 1) / 2.0).sqrt().recip();
             rates.extend([f64::from(adam.lr_color) * pace; 3]);
             rates.extend([f64::from(adam.lr_harmonics) * pace; 9]);
-            let decay = (f64::from(adam.beta_1), f64::from(adam.beta_2), f64::from(adam.epsilon));
+            let decay = Decay64 { beta_1: adam.beta_1.into(), beta_2: adam.beta_2.into(), epsilon: adam.epsilon.into() };
             let before = states[i].steps;
             states[i].step(&mut expected[i], &gradient.flat(), &rates, decay);
             if states[i].steps > before {

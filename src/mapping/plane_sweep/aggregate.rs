@@ -59,9 +59,10 @@ fn scan(costs: &[u8], gray: &GrayImage, planes: usize, (width, height): (usize, 
                     let row = &mut rows[direction];
                     if from_y == y {
                         let (before, after) = row.costs.split_at_mut(to.start);
-                        go_on(own, (&before[at], row.least[from_x]), other, &mut after[..planes], sum)
+                        extend(own, &Path { costs: &before[at], least: row.least[from_x] }, other, &mut after[..planes], sum)
                     } else {
-                        go_on(own, (&last[direction].costs[at], last[direction].least[from_x]), other, &mut row.costs[to], sum)
+                        let last = Path { costs: &last[direction].costs[at], least: last[direction].least[from_x] };
+                        extend(own, &last, other, &mut row.costs[to], sum)
                     }
                 };
                 rows[direction].least[x] = least;
@@ -82,8 +83,15 @@ fn start(own: &[u8], to: &mut [u16], sum: &mut [u16]) -> u16 {
     least
 }
 
-/// A path goes on from its last costs and the least of these; returns the least of the new ones.
-fn go_on(own: &[u8], (last, last_least): (&[u16], u16), other: u16, to: &mut [u16], sum: &mut [u16]) -> u16 {
+/// A path's costs at its last pixel.
+struct Path<'a> {
+    costs: &'a [u16],
+    least: u16,
+}
+
+/// Extends a path by one pixel; returns the least of its new costs.
+fn extend(own: &[u8], path: &Path<'_>, other: u16, to: &mut [u16], sum: &mut [u16]) -> u16 {
+    let Path { costs: last, least: last_least } = *path;
     let jump = last_least + other;
     let planes = own.len();
     let mut least = u16::MAX;

@@ -1,7 +1,7 @@
 //! The passes after the forward rendering, encoded: loss, backward, and the log of the step.
 
 use super::{Sink, StepLog, Trainer};
-use crate::gpu::GpuBuffer;
+use crate::gpu::{GpuBuffer, IndirectSize};
 use crate::optimise::image_buffers::LOSS_TILE;
 use crate::optimise::{LossConfig, TargetImage};
 use crate::render::layout::{Counter, LossSetup, VISIBLE_COUNTER};
@@ -63,7 +63,7 @@ impl Trainer {
             (4, &self.pose_sums),
             (5, cloud.parameters()),
         ];
-        let arguments = (&ws.counters, Counter::per_element_offset(VISIBLE_COUNTER));
+        let arguments = IndirectSize { buffer: &ws.counters, offset: Counter::per_element_offset(VISIBLE_COUNTER) };
         let kernel = match sink {
             Sink::Adam => {
                 project.extend([(6, cloud.moments_1()), (7, cloud.moments_2()), (8, &self.adam), (9, cloud.averages())]);

@@ -8,6 +8,7 @@
 use crate::geometry::{Pinhole, Se3};
 use crate::tracking::TrackingConfig;
 use crate::tracking::map::sparse_map::{LandmarkState, Map, Observation};
+use crate::tracking::rig::Rig;
 use crate::tracking::solvers::bundle::{BundleObservation, BundleProblem, RelativePose};
 use crate::tracking::solvers::residual::InlierClass;
 
@@ -116,7 +117,8 @@ impl Adjustment {
 }
 
 /// Adjusts the window around `keyframe` at once.
-pub fn adjust_window(map: &mut Map, keyframe: usize, pinhole: &Pinhole, config: &TrackingConfig) {
+pub fn adjust_window(map: &mut Map, keyframe: usize, rig: &Rig) {
+    let Rig { pinhole, config } = rig;
     if let Some(mut window) = Adjustment::of_window(map, keyframe, config) {
         window.solve(pinhole, config.bundle_iterations);
         window.apply(map, config);

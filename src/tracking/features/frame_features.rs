@@ -23,7 +23,7 @@ pub struct Feature {
     pub pixel: Vector2<f64>,
     pub octave: u8,
     pub angle_rad: f32,
-    /// Metres along z, where it was measured and is believed.
+    /// Metres along z, where it was measured, away from edges and within range.
     pub depth_metres: Option<f64>,
     /// Standard deviation of the measured inverse depth, 1/metres.
     pub inverse_depth_sigma: f64,
@@ -60,40 +60,6 @@ impl FrameFeatures {
         Self { features, columns, rows, cells, order }
     }
 
-    /// Extracts the features of a frame and finds their depths, from the depth image or from the right eye.
-    pub fn of_frame(
-        (frame, grey): (&Frame, &[u8]),
-        (camera, sensor): (&Camera, Sensor),
-        extractor: &Extractor,
-        config: &TrackingConfig,
-    ) -> Result<Self, TrackingError> {
-        let (keypoints, depths) = match (sensor, &frame.right) {
-            (Sensor::Stereo { baseline_metres }, Some(right)) => {
-                stereo_depths(grey, right.as_raw(), camera.pinhole.fx * baseline_metres, camera.pinhole.fx, (extractor, config))?
-            }
-            _ => {
-                let keypoints = extractor.extract(&extractor.pyramid(grey)?)?;
-                let depth = |k: &Keypoint| believed_depth(frame.depth.as_ref()?, &k.pixel, config);
-                let depths = keypoints.iter().map(|k| Some((depth(k)?, config.inverse_depth_sigma))).collect();
-                (keypoints, depths)
-            }
-        };
-        let features = keypoints
-            .into_iter()
-            .zip(depths)
-            .map(|(k, depth)| Feature {
-                pixel: camera.undistort_pixel(&k.pixel),
-                octave: k.octave,
-                angle_rad: k.angle_rad,
-                depth_metres: depth.map(|(metres, _)| metres),
-                inverse_depth_sigma: depth.map_or(0.0, |(_, sigma)| sigma),
-                descriptor: k.descriptor,
-            })
-            .filter(|f| f.pixel.iter().all(|v| v.is_finite()))
-            .collect();
-        Ok(Self::new(features, &camera.pinhole))
-    }
-
     pub fn len(&self) -> usize {
         self.features.len()
     }
@@ -119,11 +85,73 @@ impl FrameFeatures {
         Some(Point3::from(pinhole.unproject(&feature.pixel, depth)))
     }
 
-    /// Median of the believed depths, metres.
+    /// Median of the measured depths, metres.
     pub fn median_depth(&self) -> Option<f64> {
         let mut depths: Vec<f64> = self.features.iter().filter_map(|f| f.depth_metres).collect();
         depths.sort_by(f64::total_cmp);
         depths.get(depths.len() / 2).copied()
+    }
+}
+
+/// Camera, sensor and ORB extractor: from a frame to its features.
+#[derive(Debug)]
+pub struct FrontEnd {
+    pub camera: Camera,
+    pub sensor: Sensor,
+    pub extractor: Extractor,
+}
+
+impl FrontEnd {
+    /// Extracts the features of a frame, with depth from its depth image or right image. `grey` is its luma, row-major.
+    pub fn features(&self, frame: &Frame, grey: &[u8], config: &TrackingConfig) -> Result<FrameFeatures, TrackingError> {
+        let (keypoints, depths) = match (self.sensor, &frame.right) {
+            (Sensor::Stereo { baseline_metres }, Some(right)) => {
+                self.stereo_depths(grey, right.as_raw(), baseline_metres, config)?
+            }
+            _ => {
+                let keypoints = self.extractor.extract(&self.extractor.pyramid(grey)?)?;
+                let depth = |k: &Keypoint| depth_at(frame.depth.as_ref()?, &k.pixel, config);
+                let depths = keypoints.iter().map(|k| Some((depth(k)?, config.inverse_depth_sigma))).collect();
+                (keypoints, depths)
+            }
+        };
+        let features = keypoints
+            .into_iter()
+            .zip(depths)
+            .map(|(k, depth)| Feature {
+                pixel: self.camera.undistort_pixel(&k.pixel),
+                octave: k.octave,
+                angle_rad: k.angle_rad,
+                depth_metres: depth.map(|(metres, _)| metres),
+                inverse_depth_sigma: depth.map_or(0.0, |(_, sigma)| sigma),
+                descriptor: k.descriptor,
+            })
+            .filter(|f| f.pixel.iter().all(|v| v.is_finite()))
+            .collect();
+        Ok(FrameFeatures::new(features, &self.camera.pinhole))
+    }
+
+    /// Keypoints of the left image with depths from the right one: depth = focal length · baseline / disparity.
+    fn stereo_depths(
+        &self,
+        left: &[u8],
+        right: &[u8],
+        baseline_metres: f64,
+        config: &TrackingConfig,
+    ) -> Result<(Vec<Keypoint>, Vec<MeasuredDepth>), TrackingError> {
+        let focal = self.camera.pinhole.fx;
+        let scale = focal * baseline_metres;
+        let eye = |grey| -> Result<_, TrackingError> {
+            let pyramid = self.extractor.pyramid(grey)?;
+            Ok((self.extractor.extract(&pyramid)?, pyramid))
+        };
+        let (left, right) = rayon::join(|| eye(left), || eye(right));
+        let ((keypoints, left), (others, right)) = (left?, right?);
+        let (left, right) = (Eye { keypoints: &keypoints, pyramid: &left }, Eye { keypoints: &others, pyramid: &right });
+        let disparities = disparities(left, right, focal, config.pyramid_scale)?;
+        let sigma = |k: &Keypoint| config.disparity_sigma * config.pyramid_scale.powi(k.octave.into()) / scale;
+        let depths = keypoints.iter().zip(disparities).map(|(k, disparity)| disparity.map(|d| (scale / d, sigma(k)))).collect();
+        Ok((keypoints, depths))
     }
 }
 
@@ -142,28 +170,6 @@ impl Feature {
 /// Metres and the standard deviation of the inverse depth, 1/metres, where a depth was measured.
 type MeasuredDepth = Option<(f64, f64)>;
 
-/// Keypoints of the left image, and their depths from the right one. `scale` is the product
-/// of focal length and baseline: depth = scale / disparity.
-fn stereo_depths(
-    left: &[u8],
-    right: &[u8],
-    scale: f64,
-    max_disparity: f64,
-    (extractor, config): (&Extractor, &TrackingConfig),
-) -> Result<(Vec<Keypoint>, Vec<MeasuredDepth>), TrackingError> {
-    let eye = |grey| -> Result<_, TrackingError> {
-        let pyramid = extractor.pyramid(grey)?;
-        Ok((extractor.extract(&pyramid)?, pyramid))
-    };
-    let (left, right) = rayon::join(|| eye(left), || eye(right));
-    let ((keypoints, left), (others, right)) = (left?, right?);
-    let eyes = (Eye { keypoints: &keypoints, pyramid: &left }, Eye { keypoints: &others, pyramid: &right });
-    let disparities = disparities(eyes.0, eyes.1, max_disparity, config.pyramid_scale)?;
-    let sigma = |k: &Keypoint| config.disparity_sigma * config.pyramid_scale.powi(k.octave.into()) / scale;
-    let depths = keypoints.iter().zip(disparities).map(|(k, disparity)| disparity.map(|d| (scale / d, sigma(k)))).collect();
-    Ok((keypoints, depths))
-}
-
 /// The grid line (row or column) of a coordinate; what lies outside belongs to the border.
 fn cell(coordinate: f64, count: usize) -> usize {
     ((coordinate / CELL_PIXELS).max(0.0) as usize).min(count - 1)
@@ -176,7 +182,7 @@ pub fn luma(image: &RgbImage) -> Vec<u8> {
 }
 
 /// The depth at a recorded pixel, unless it is out of range, not finite, or on an edge.
-fn believed_depth(depth: &DepthImage, pixel: &Vector2<f64>, config: &TrackingConfig) -> Option<f64> {
+fn depth_at(depth: &DepthImage, pixel: &Vector2<f64>, config: &TrackingConfig) -> Option<f64> {
     let (x, y) = (pixel.x.round(), pixel.y.round());
     if x < 0.0 || y < 0.0 || x >= f64::from(depth.width) || y >= f64::from(depth.height) {
         return None;
@@ -223,11 +229,11 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn depth_on_an_edge_or_out_of_range_is_not_believed() {
+    fn depth_on_an_edge_or_out_of_range_is_left_out() {
         let metres = (0..100).map(|i| if i % 10 < 5 { 1.0 } else { 2.0 }).collect();
         let mut depth = DepthImage { width: 10, height: 10, metres };
         depth.metres[3 * 10 + 1] = f32::NAN;
-        let at = |x: f64, y: f64| believed_depth(&depth, &Vector2::new(x, y), &TrackingConfig::default());
+        let at = |x: f64, y: f64| depth_at(&depth, &Vector2::new(x, y), &TrackingConfig::default());
         assert_eq!(at(2.2, 6.0), Some(1.0));
         assert_eq!((at(4.0, 6.0), at(5.0, 6.0), at(7.0, 6.0)), (None, None, Some(2.0)));
         assert_eq!((at(1.0, 3.0), at(-3.0, 0.0), at(9.6, 2.0)), (None, None, None));

@@ -4,5 +4,6 @@ pub mod descriptor;
 pub mod frame_features;
 pub mod matching;
 pub mod orb;
+pub mod projection;
 pub mod quadtree;
 pub mod stereo;

@@ -11,6 +11,7 @@ use crate::tracking::features::frame_features::FrameFeatures;
 use crate::tracking::features::matching::{Match, Query, Rules, match_by_projection};
 use crate::tracking::initialisation::two_view::two_views;
 use crate::tracking::map::sparse_map::{Keyframe, Map, Observation};
+use crate::tracking::rig::Rig;
 
 /// How far a feature may move from one frame to the next, as a share of the image's width.
 const SEARCH_SHARE: f64 = 0.16;
@@ -59,14 +60,17 @@ impl FirstView {
     }
 }
 
+/// The frame that completes a two-view start.
+pub struct SecondView<'a> {
+    pub frame_index: usize,
+    pub timestamp_s: f64,
+    pub features: &'a Arc<FrameFeatures>,
+}
+
 /// The map of two keyframes, if the first view and this frame show one scene from two places.
-pub fn first_map(
-    first: &FirstView,
-    (frame_index, timestamp_s, features): (usize, f64, &Arc<FrameFeatures>),
-    matches: &[Match],
-    pinhole: &Pinhole,
-    config: &TrackingConfig,
-) -> Option<Map> {
+pub fn first_map(first: &FirstView, second: &SecondView<'_>, matches: &[Match], rig: &Rig) -> Option<Map> {
+    let Rig { pinhole, config } = rig;
+    let SecondView { frame_index, timestamp_s, features } = *second;
     let pixels: Vec<(Vector2<f64>, Vector2<f64>)> =
         matches.iter().map(|m| (first.features.features[m.query].pixel, features.features[m.feature].pixel)).collect();
     let found = two_views(&pixels, pinhole)?;
@@ -85,7 +89,7 @@ pub fn first_map(
         let landmark = map.add_landmark(Observation { keyframe: 0, feature: m.query }, *point, config);
         map.add_observation(landmark, Observation { keyframe: 1, feature: m.feature });
     }
-    local_bundle::adjust_window(&mut map, 1, pinhole, config);
+    local_bundle::adjust_window(&mut map, 1, rig);
     rescale(&mut map, config)?;
     (map.keyframes[1].landmark_count(&map, 2) >= config.min_initial_landmarks).then_some(map)
 }

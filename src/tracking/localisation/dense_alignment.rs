@@ -172,18 +172,21 @@ struct Sums {
 /// does not hold the pose (a single plane without texture).
 pub fn align(reference: &DenseFrame, current: &DenseFrame, guesses: &[Se3]) -> Option<Aligned> {
     let mut best: Option<(f64, Aligned)> = None;
-    let levels: Vec<(Level, Level, usize, f64)> = LEVELS
+    let levels: Vec<LevelPair> = LEVELS
         .iter()
-        .map(|(halvings, steps)| {
-            (Level::new(reference, *halvings), Level::new(current, *halvings), *steps, HUBER * f64::from(1 << halvings))
+        .map(|(halvings, steps)| LevelPair {
+            reference: Level::new(reference, *halvings),
+            current: Level::new(current, *halvings),
+            steps: *steps,
+            huber: HUBER * f64::from(1 << halvings),
         })
         .collect();
     for guess in guesses {
         let mut pose = *guess;
-        for (reference, current, steps, huber) in &levels {
-            pose = descend(reference, current, pose, (*steps, *huber));
+        for level in &levels {
+            pose = descend(level, pose);
         }
-        let (reference, current, _, huber) = &levels[levels.len() - 1];
+        let LevelPair { reference, current, huber, .. } = &levels[levels.len() - 1];
         let sums = linearise(reference, current, &pose, *huber);
         let agreement = sums.agree as f64 / sums.in_view.max(1) as f64;
         let overlap = sums.agree as f64 / sums.points.max(1) as f64;
@@ -198,11 +201,21 @@ pub fn align(reference: &DenseFrame, current: &DenseFrame, guesses: &[Se3]) -> O
     best.map(|(_, aligned)| aligned)
 }
 
+/// Both frames at one pyramid level, and the level's schedule.
+struct LevelPair {
+    reference: Level,
+    current: Level,
+    /// Most Gauss-Newton steps.
+    steps: usize,
+    /// Threshold of the robust loss, standard deviations.
+    huber: f64,
+}
+
 /// Gauss-Newton with damping on one level.
-fn descend(reference: &Level, current: &Level, initial: Se3, (steps, huber): (usize, f64)) -> Se3 {
+fn descend(level: &LevelPair, initial: Se3) -> Se3 {
     let mut pose = initial;
-    for _ in 0..steps {
-        let sums = linearise(reference, current, &pose, huber);
+    for _ in 0..level.steps {
+        let sums = linearise(&level.reference, &level.current, &pose, level.huber);
         let mut damped = sums.hessian;
         (0..6).for_each(|k| damped[(k, k)] += 1e-3 * sums.hessian[(k, k)] + 1e-3);
         let Some(step) = damped.cholesky().map(|c| c.solve(&-sums.gradient)) else { break };

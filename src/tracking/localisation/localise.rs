@@ -5,18 +5,20 @@ use std::sync::Arc;
 
 use nalgebra::Point3;
 
-use crate::geometry::{Pinhole, Se3};
-use crate::tracking::TrackingConfig;
-use crate::tracking::features::frame_features::FrameFeatures;
-use crate::tracking::features::matching::{Query, Rules, match_by_projection};
+use crate::geometry::Se3;
+use crate::tracking::features::frame_features::{Feature, FrameFeatures};
+use crate::tracking::features::matching::Rules;
+use crate::tracking::features::projection::{Projection, ProjectionSearch};
 use crate::tracking::localisation::pnp::{pose_from_view, similar_keyframes};
 use crate::tracking::map::sparse_map::Map;
+use crate::tracking::rig::Rig;
 use crate::tracking::solvers::pose::{PoseObservation, optimise_pose};
 use crate::tracking::solvers::residual::InlierClass;
 
 /// Search radius around last frame's points, pixels at the finest level, widened in turn until enough are found.
 const MOTION_RADII: [f64; 3] = [8.0, 16.0, 32.0];
-const MOTION_RULES: Rules = Rules { max_distance: 80, ratio: 0.9, check_rotation: true };
+const MOTION_SEARCH: ProjectionSearch =
+    ProjectionSearch { taken: &[], coarser_octaves: 1, rules: Rules { max_distance: 80, ratio: 0.9, check_rotation: true } };
 /// Matches with which a search is wide enough, and inliers with which its pose is believed enough to look at the map.
 const MOTION_MATCHES: usize = 40;
 const MOTION_INLIERS: usize = 15;
@@ -71,8 +73,7 @@ pub struct View {
 /// What the searches need.
 pub struct Context<'a> {
     pub map: &'a mut Map,
-    pub pinhole: &'a Pinhole,
-    pub config: &'a TrackingConfig,
+    pub rig: &'a Rig,
 }
 
 impl Context<'_> {
@@ -99,7 +100,7 @@ impl Context<'_> {
 
     /// From a view without a prediction.
     pub fn against_view(&self, frame: &FrameFeatures, view: &View) -> Option<Localised> {
-        let rough = pose_from_view(&view.features.features, &view.points, frame, self.pinhole)?;
+        let rough = pose_from_view(&view.features.features, &view.points, frame, &self.rig.pinhole)?;
         let pairs: Vec<(usize, usize)> = rough.matches.iter().map(|m| (m.query, m.feature)).collect();
         let mut found = self.settle(frame, &rough.camera_from_world, &pairs, |i| view.points[i], |i| view.landmarks[i]);
         if found.inliers >= ROUGH_INLIERS {
@@ -113,7 +114,7 @@ impl Context<'_> {
     /// The last frame as a view: its landmarks, and temporary points from depth for its other features.
     pub fn view_of_last(&self, last: &LastFrame) -> View {
         let world_from_camera = last.camera_from_world.inverse();
-        let temporary = |i| last.features.point_in_camera(i, self.pinhole).map(|p| world_from_camera * p);
+        let temporary = |i| last.features.point_in_camera(i, &self.rig.pinhole).map(|p| world_from_camera * p);
         let point = |i: usize| last.landmarks[i].map(|l| self.map.landmarks[l].position).or_else(|| temporary(i));
         View {
             features: last.features.clone(),
@@ -149,34 +150,21 @@ impl Context<'_> {
 
     /// Refines a pose with all landmarks around it.
     pub fn in_local_map(&mut self, frame: &FrameFeatures, start: &Localised, reference: usize) -> Localised {
-        let mut taken: Vec<bool> = start.landmarks.iter().map(Option::is_some).collect();
+        let taken: Vec<bool> = start.landmarks.iter().map(Option::is_some).collect();
         let mut pairs: Vec<(usize, usize)> =
             start.landmarks.iter().enumerate().filter_map(|(feature, l)| l.map(|l| (l, feature))).collect();
         let mut matched = vec![false; self.map.landmarks.len()];
         pairs.iter().for_each(|(l, _)| matched[*l] = true);
-        let (mut asked, mut queries) = (Vec::new(), Vec::new());
-        for l in self.local_landmarks(start, reference) {
-            let Some(seen) = self.map.predict(l, &start.camera_from_world, self.pinhole, self.config) else { continue };
-            self.map.landmarks[l].observable += 1;
-            if matched[l] {
-                continue;
-            }
-            let base = if seen.view_cosine > STRAIGHT_COSINE { MAP_RADIUS_STRAIGHT } else { MAP_RADIUS_OBLIQUE };
-            let factor = if start.rough { ROUGH_FACTOR } else { 1.0 };
-            asked.push(l);
-            queries.push(Query {
-                pixel: seen.pixel,
-                radius: base * factor * self.config.pyramid_scale.powi(seen.octave.into()),
-                octaves: seen.octave.saturating_sub(1)..=seen.octave,
-                descriptor: self.map.landmarks[l].descriptor,
-                angle_rad: 0.0,
-                inverse_depth: seen.inverse_depth,
-            });
-        }
-        for m in match_by_projection(frame, &taken, &queries, &MAP_RULES) {
-            taken[m.feature] = true;
-            pairs.push((asked[m.query], m.feature));
-        }
+        let mut visible = self.map.visible(self.local_landmarks(start, reference), &start.camera_from_world, self.rig);
+        visible.iter().for_each(|p| self.map.landmarks[p.point].observable += 1);
+        visible.retain(|p| !matched[p.point]);
+        let radius = |p: &Projection| {
+            let base = if p.view_cosine > STRAIGHT_COSINE { MAP_RADIUS_STRAIGHT } else { MAP_RADIUS_OBLIQUE };
+            base * if start.rough { ROUGH_FACTOR } else { 1.0 }
+        };
+        let search = ProjectionSearch { taken: &taken, coarser_octaves: 0, rules: MAP_RULES };
+        let found = search.run(frame, &visible, radius, self.rig);
+        pairs.extend(found.iter().map(|m| (m.point, m.feature)));
         let mut found = self.settle(frame, &start.camera_from_world, &pairs, |l| Some(self.map.landmarks[l].position), Some);
         found.rough = start.rough;
         for l in found.landmarks.iter().flatten() {
@@ -194,7 +182,8 @@ impl Context<'_> {
         for (feature, landmark) in landmarks.iter_mut().enumerate() {
             let agrees = |l: &usize| {
                 let p_in_camera = (camera_from_world * self.map.landmarks[*l].position).coords;
-                frame.features[feature].measurement(self.config).classify(self.pinhole, &p_in_camera) != InlierClass::Outlier
+                frame.features[feature].measurement(&self.rig.config).classify(&self.rig.pinhole, &p_in_camera)
+                    != InlierClass::Outlier
             };
             *landmark = landmark.filter(agrees);
         }
@@ -215,12 +204,12 @@ impl Context<'_> {
         let usable: Vec<(usize, usize, PoseObservation)> = pairs
             .iter()
             .filter_map(|(source, feature)| {
-                let measurement = frame.features[*feature].measurement(self.config);
+                let measurement = frame.features[*feature].measurement(&self.rig.config);
                 known(*source).map(|point_in_world| (*source, *feature, PoseObservation { point_in_world, measurement }))
             })
             .collect();
         let observations: Vec<PoseObservation> = usable.iter().map(|u| u.2).collect();
-        let estimate = optimise_pose(self.pinhole, initial, &observations);
+        let estimate = optimise_pose(&self.rig.pinhole, initial, &observations);
         for ((source, feature, _), trust) in usable.iter().zip(&estimate.classes) {
             if *trust != InlierClass::Outlier {
                 landmarks[*feature] = landmark_of(*source);
@@ -238,23 +227,23 @@ impl Context<'_> {
 
     /// Looks for a view's points around where `pose` shows them, and settles the pose; also returns the number of matches.
     fn search(&self, frame: &FrameFeatures, view: &View, pose: &Se3, radius: f64) -> (Localised, usize) {
-        let (mut asked, mut queries) = (Vec::new(), Vec::new());
-        for (index, (feature, point)) in view.features.features.iter().zip(&view.points).enumerate() {
-            let Some(point) = point else { continue };
-            let p_in_camera = (pose * point).coords;
-            let Some(pixel) = self.pinhole.project(&p_in_camera).filter(|p| self.pinhole.contains(p, 0.0)) else { continue };
-            asked.push(index);
-            queries.push(Query {
-                pixel,
-                radius: radius * self.config.pyramid_scale.powi(feature.octave.into()),
-                octaves: feature.octave.saturating_sub(1)..=feature.octave + 1,
+        let pinhole = &self.rig.pinhole;
+        let project = |(index, (feature, point)): (usize, (&Feature, &Option<Point3<f64>>))| {
+            let p_in_camera = (pose * (*point)?).coords;
+            Some(Projection {
+                point: index,
+                pixel: pinhole.project(&p_in_camera).filter(|p| pinhole.contains(p, 0.0))?,
+                octave: feature.octave,
+                view_cosine: 1.0,
+                inverse_depth: 1.0 / p_in_camera.z,
                 descriptor: feature.descriptor,
                 angle_rad: feature.angle_rad,
-                inverse_depth: 1.0 / p_in_camera.z,
-            });
-        }
-        let matches = match_by_projection(frame, &[], &queries, &MOTION_RULES);
-        let pairs: Vec<(usize, usize)> = matches.iter().map(|m| (asked[m.query], m.feature)).collect();
+            })
+        };
+        let projections: Vec<Projection> =
+            view.features.features.iter().zip(&view.points).enumerate().filter_map(project).collect();
+        let matches = MOTION_SEARCH.run(frame, &projections, |_| radius, self.rig);
+        let pairs: Vec<(usize, usize)> = matches.iter().map(|m| (m.point, m.feature)).collect();
         (self.settle(frame, pose, &pairs, |i| view.points[i], |i| view.landmarks[i]), matches.len())
     }
 

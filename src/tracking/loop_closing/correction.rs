@@ -3,11 +3,12 @@
 //! bundle adjustment of all keyframes that settles the rest is up to the caller.
 
 use crate::geometry::sim3::Vector7;
-use crate::geometry::{Pinhole, Se3, Sim3};
+use crate::geometry::{Se3, Sim3};
 use crate::tracking::TrackingConfig;
 use crate::tracking::loop_closing::detection::{CONNECTED_SHARED, Recognised};
 use crate::tracking::map::insertion::fuse;
 use crate::tracking::map::sparse_map::{LandmarkState, Map, Observation};
+use crate::tracking::rig::Rig;
 use crate::tracking::solvers::pose_graph::{Edge, PoseGraph};
 use crate::tracking::solvers::relative_pose::passes_gate;
 
@@ -35,14 +36,8 @@ pub struct MovedKeyframe {
 }
 
 /// Closes a recognised loop; `edges` are those of earlier loops and get this one's. Returns the keyframes that may have moved.
-pub fn correct(
-    map: &mut Map,
-    found: &Recognised,
-    edges: &mut Vec<Edge>,
-    scale_is_free: bool,
-    pinhole: &Pinhole,
-    config: &TrackingConfig,
-) -> Vec<MovedKeyframe> {
+pub fn correct(map: &mut Map, found: &Recognised, edges: &mut Vec<Edge>, scale_is_free: bool, rig: &Rig) -> Vec<MovedKeyframe> {
+    let config = &rig.config;
     let before: Vec<Se3> = map.keyframes.iter().map(|k| k.camera_from_world).collect();
     let keyframe_from_place = found.corrected * Sim3::from(before[found.place]).inverse();
     let depth = map.keyframes[found.keyframe].features.median_depth().or_else(|| map.median_depth(found.keyframe)).unwrap_or(1.0);
@@ -65,9 +60,9 @@ pub fn correct(
     let neighbours: Vec<usize> =
         map.covisible(found.keyframe).into_iter().filter(|(_, n)| *n >= CONNECTED_SHARED).map(|(k, _)| k).collect();
     take_over(map, found, config);
-    fuse(map, found.keyframe, &found.landmarks, pinhole, config);
+    fuse(map, found.keyframe, &found.landmarks, rig);
     for neighbour in neighbours.into_iter().take(FUSED_NEIGHBOURS) {
-        fuse(map, neighbour, &found.landmarks, pinhole, config);
+        fuse(map, neighbour, &found.landmarks, rig);
     }
     (1..graph.poses.len()).map(|k| MovedKeyframe { keyframe: k, growth: growth(k) }).collect()
 }

@@ -5,10 +5,11 @@
 //! as much as its own neighbours do, the landmarks must align rigidly, most of what should be seen must be seen, neighbours must agree,
 //! and the correction must be one that drift can explain.
 
-use crate::geometry::{Pinhole, Se3, Sim3};
-use crate::tracking::TrackingConfig;
-use crate::tracking::features::matching::{Query, Rules, match_all, match_by_projection};
+use crate::geometry::{Se3, Sim3};
+use crate::tracking::features::matching::{Rules, match_all};
+use crate::tracking::features::projection::{PointMatch, ProjectionSearch};
 use crate::tracking::map::sparse_map::Map;
+use crate::tracking::rig::Rig;
 use crate::tracking::solvers::pose::{PoseObservation, optimise_pose};
 use crate::tracking::solvers::residual::InlierClass;
 use crate::tracking::solvers::sim3_alignment::{Pair, align_pairs};
@@ -25,7 +26,8 @@ const MATCH_RULES: Rules = Rules { max_distance: 50, ratio: 0.85, check_rotation
 const PLACE_NEIGHBOURS: usize = 8;
 /// Search radius around the place's landmarks, pixels at the finest level.
 const PROJECTION_RADIUS: f64 = 6.0;
-const PROJECTION_RULES: Rules = Rules { max_distance: 60, ratio: 0.9, check_rotation: false };
+const PROJECTION_SEARCH: ProjectionSearch =
+    ProjectionSearch { taken: &[], coarser_octaves: 1, rules: Rules { max_distance: 60, ratio: 0.9, check_rotation: false } };
 /// Landmarks of the place that the keyframe must show, in number and as a share of what it should show.
 const MIN_INLIERS: usize = 40;
 const MIN_FOUND_SHARE: f64 = 0.15;
@@ -62,8 +64,7 @@ pub fn knows_scale(map: &Map) -> bool {
 /// What recognition needs.
 pub struct Search<'a> {
     pub map: &'a Map,
-    pub pinhole: &'a Pinhole,
-    pub config: &'a TrackingConfig,
+    pub rig: &'a Rig,
     pub scale_is_free: bool,
 }
 
@@ -137,40 +138,28 @@ impl Search<'_> {
             Some(Pair {
                 p_in_a: a.camera_from_world * p.position,
                 p_in_b: b.camera_from_world * q.position,
-                in_a: a.features.features[i].measurement(self.config),
-                in_b: b.features.features[j].measurement(self.config),
+                in_a: a.features.features[i].measurement(&self.rig.config),
+                in_b: b.features.features[j].measurement(&self.rig.config),
             })
         };
         let pairs: Vec<Pair> = matches.iter().filter_map(|m| pair((m.query, m.feature))).collect();
-        align_pairs(&pairs, self.pinhole, self.scale_is_free)
+        align_pairs(&pairs, &self.rig.pinhole, self.scale_is_free)
     }
 
     /// Looks for landmarks in a keyframe as if it were at `camera_from_world`, and improves that pose by what it finds.
     fn search_in(&self, landmarks: &[usize], keyframe: usize, camera_from_world: &Se3) -> Seen {
         let features = &self.map.keyframes[keyframe].features;
-        let (mut asked, mut queries) = (Vec::new(), Vec::new());
-        for l in landmarks {
-            let Some(seen) = self.map.predict(*l, camera_from_world, self.pinhole, self.config) else { continue };
-            asked.push(*l);
-            queries.push(Query {
-                pixel: seen.pixel,
-                radius: PROJECTION_RADIUS * self.config.pyramid_scale.powi(seen.octave.into()),
-                octaves: seen.octave.saturating_sub(1)..=seen.octave + 1,
-                descriptor: self.map.landmarks[*l].descriptor,
-                angle_rad: 0.0,
-                inverse_depth: seen.inverse_depth,
-            });
-        }
-        let found = match_by_projection(features, &[], &queries, &PROJECTION_RULES);
-        let observation = |landmark: usize, feature: usize| PoseObservation {
-            point_in_world: self.map.landmarks[landmark].position,
-            measurement: features.features[feature].measurement(self.config),
+        let visible = self.map.visible(landmarks.iter().copied(), camera_from_world, self.rig);
+        let found = PROJECTION_SEARCH.run(features, &visible, |_| PROJECTION_RADIUS, self.rig);
+        let observation = |m: &PointMatch| PoseObservation {
+            point_in_world: self.map.landmarks[m.point].position,
+            measurement: features.features[m.feature].measurement(&self.rig.config),
         };
-        let observations: Vec<PoseObservation> = found.iter().map(|m| observation(asked[m.query], m.feature)).collect();
-        let estimate = optimise_pose(self.pinhole, camera_from_world, &observations);
-        let good = found.iter().zip(&estimate.classes).filter(|(_, trust)| **trust != InlierClass::Outlier);
-        let matches = good.map(|(m, _)| (asked[m.query], m.feature)).collect();
-        Seen { camera_from_world: estimate.camera_from_world, matches, expected: asked.len() }
+        let observations: Vec<PoseObservation> = found.iter().map(observation).collect();
+        let estimate = optimise_pose(&self.rig.pinhole, camera_from_world, &observations);
+        let good = found.iter().zip(&estimate.classes).filter(|(_, class)| **class != InlierClass::Outlier);
+        let matches = good.map(|(m, _)| (m.point, m.feature)).collect();
+        Seen { camera_from_world: estimate.camera_from_world, matches, expected: visible.len() }
     }
 
     /// Whether drift on the way from `place` to `keyframe` can explain the correction.

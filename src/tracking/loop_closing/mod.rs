@@ -5,9 +5,8 @@ mod detection;
 #[cfg(test)]
 pub mod tests;
 
-use crate::geometry::Pinhole;
-use crate::tracking::TrackingConfig;
 use crate::tracking::map::Map;
+use crate::tracking::rig::Rig;
 use crate::tracking::solvers::pose_graph::Edge;
 pub use correction::MovedKeyframe;
 use correction::correct;
@@ -28,17 +27,17 @@ pub struct LoopCloser {
 impl LoopCloser {
     /// Closes a loop if `keyframe`, one of the newest, shows a place left long ago. Returns the keyframes that may have moved, in ascending
     /// order; none if there was no loop.
-    pub fn close(&mut self, map: &mut Map, keyframe: usize, pinhole: &Pinhole, config: &TrackingConfig) -> Vec<MovedKeyframe> {
+    pub fn close(&mut self, map: &mut Map, keyframe: usize, rig: &Rig) -> Vec<MovedKeyframe> {
         if self.last.is_some_and(|last| keyframe < last + REST) {
             return Vec::new();
         }
-        let search = Search { map, pinhole, config, scale_is_free: !knows_scale(map) };
+        let search = Search { map, rig, scale_is_free: !knows_scale(map) };
         let recognised = search.candidates(keyframe).into_iter().find_map(|place| search.recognise(keyframe, place));
         let Some(recognised) = recognised else { return Vec::new() };
         let scale_is_free = search.scale_is_free;
         self.last = Some(keyframe);
         tracing::info!(keyframe, place = recognised.place, landmarks = recognised.matches.len(), "loop closed");
-        correct(map, &recognised, &mut self.edges, scale_is_free, pinhole, config)
+        correct(map, &recognised, &mut self.edges, scale_is_free, rig)
     }
 
     /// Whether a loop begins or ends at a keyframe.

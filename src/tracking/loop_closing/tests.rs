@@ -12,6 +12,7 @@ use crate::tracking::features::descriptor::Descriptor;
 use crate::tracking::features::frame_features::{Feature, FrameFeatures};
 use crate::tracking::loop_closing::LoopCloser;
 use crate::tracking::map::sparse_map::{Keyframe, Map, Observation};
+use crate::tracking::rig::Rig;
 use crate::tracking::solvers::relative_pose::PoseMeasurement;
 use crate::tracking::solvers::residual::tests::PINHOLE;
 
@@ -104,7 +105,7 @@ fn a_loop_is_closed_with_and_without_scale() {
         let (newest, before) = (map.keyframes.len() - 1, off_metres(&map, !with_depth));
         assert!(before > 0.1 && map.covisible(newest).iter().all(|(k, _)| *k > 20), "{before} m");
         let mut again = map.clone();
-        let moved = LoopCloser::default().close(&mut map, newest, &PINHOLE, &config);
+        let moved = LoopCloser::default().close(&mut map, newest, &Rig { pinhole: PINHOLE, config: config.clone() });
         let mut all = Adjustment::of_all(&map, &config).unwrap();
         all.solve(&PINHOLE, config.bundle_iterations);
         all.apply(&mut map, &config);
@@ -114,7 +115,7 @@ fn a_loop_is_closed_with_and_without_scale() {
         assert!(after < 0.25 * before, "{before} m → {after} m with depth: {with_depth}");
         assert!(map.covisible(newest).iter().any(|(k, shared)| *k < 10 && *shared > 50), "both ends of the loop are joined");
 
-        LoopCloser::default().close(&mut again, newest, &PINHOLE, &config);
+        LoopCloser::default().close(&mut again, newest, &Rig { pinhole: PINHOLE, config: config.clone() });
         all.apply(&mut again, &config);
         assert_eq!(again.keyframes[newest].camera_from_world, map.keyframes[newest].camera_from_world);
     }
@@ -140,7 +141,7 @@ fn measured_poses_hold_the_corrected_map_together_if_they_are_believed() {
             };
             map.add_pose_prior(measurement);
         }
-        assert!(!LoopCloser::default().close(&mut map, newest, &PINHOLE, &config).is_empty());
+        assert!(!LoopCloser::default().close(&mut map, newest, &Rig { pinhole: PINHOLE, config: config.clone() }).is_empty());
         map.keyframes.iter().map(|k| k.camera_from_world).collect::<Vec<_>>()
     };
     let without = close(None);
@@ -154,10 +155,10 @@ fn no_loop_is_seen_where_there_is_none() {
     let mut map = drifted(&Sim3::identity(), true, &config);
     let mut closer = LoopCloser::default();
     // Half way round; and a drift that nobody would believe.
-    assert!(closer.close(&mut map, STATIONS / 2, &PINHOLE, &config).is_empty());
+    assert!(closer.close(&mut map, STATIONS / 2, &Rig { pinhole: PINHOLE, config: config.clone() }).is_empty());
     let newest = map.keyframes.len() - 1;
     for keyframe in &mut map.keyframes[STATIONS - 4..] {
         keyframe.camera_from_world = Se3::translation(30.0, 0.0, 0.0) * keyframe.camera_from_world;
     }
-    assert!(closer.close(&mut map, newest, &PINHOLE, &config).is_empty());
+    assert!(closer.close(&mut map, newest, &Rig { pinhole: PINHOLE, config: config.clone() }).is_empty());
 }

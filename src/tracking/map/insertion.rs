@@ -3,10 +3,10 @@
 
 use std::collections::BTreeSet;
 
-use crate::geometry::Pinhole;
-use crate::tracking::TrackingConfig;
-use crate::tracking::features::matching::{Query, Rules, match_by_projection};
+use crate::tracking::features::matching::Rules;
+use crate::tracking::features::projection::{PointMatch, ProjectionSearch};
 use crate::tracking::map::sparse_map::{Keyframe, LandmarkState, Map, Observation};
+use crate::tracking::rig::Rig;
 use crate::tracking::solvers::residual::InlierClass;
 
 /// Keyframes with which landmarks are joined: those sharing most landmarks. What lies near but shares none is a matter for
@@ -14,14 +14,16 @@ use crate::tracking::solvers::residual::InlierClass;
 const FUSED_COVISIBLE: usize = 10;
 /// Search radius when joining, pixels at the finest level.
 const FUSE_RADIUS: f64 = 3.0;
-const FUSE_RULES: Rules = Rules { max_distance: 50, ratio: 1.0, check_rotation: false };
+const FUSE_SEARCH: ProjectionSearch =
+    ProjectionSearch { taken: &[], coarser_octaves: 0, rules: Rules { max_distance: 50, ratio: 1.0, check_rotation: false } };
 /// A landmark is on probation for this many keyframes, and must then be seen by two; by three if it was triangulated from two.
 const RECENT_KEYFRAMES: usize = 3;
 /// Share of the frames that should see a landmark which must do so.
 const MIN_OBSERVED_SHARE: f64 = 0.25;
 
 /// Puts a keyframe in the map with the landmarks that its frame was tracked by; makes new ones from depth. Returns its id.
-pub fn insert_keyframe(map: &mut Map, mut keyframe: Keyframe, pinhole: &Pinhole, config: &TrackingConfig) -> usize {
+pub fn insert_keyframe(map: &mut Map, mut keyframe: Keyframe, rig: &Rig) -> usize {
+    let Rig { pinhole, config } = rig;
     let id = map.keyframes.len();
     let tracked = std::mem::take(&mut keyframe.landmarks);
     let features = keyframe.features.clone();
@@ -46,47 +48,32 @@ pub fn insert_keyframe(map: &mut Map, mut keyframe: Keyframe, pinhole: &Pinhole,
 }
 
 /// Joins the landmarks of a keyframe with those of its neighbours, both ways.
-pub fn fuse_with_neighbours(map: &mut Map, keyframe: usize, pinhole: &Pinhole, config: &TrackingConfig) {
+pub fn fuse_with_neighbours(map: &mut Map, keyframe: usize, rig: &Rig) {
     let neighbours: Vec<usize> = map.covisible(keyframe).into_iter().take(FUSED_COVISIBLE).map(|(k, _)| k).collect();
     for other in &neighbours {
         let own: Vec<usize> = map.keyframes[keyframe].landmarks.iter().flatten().copied().collect();
-        fuse(map, *other, &own, pinhole, config);
+        fuse(map, *other, &own, rig);
     }
     let theirs = map.landmarks_of(&neighbours);
-    fuse(map, keyframe, &theirs, pinhole, config);
+    fuse(map, keyframe, &theirs, rig);
 }
 
 /// Looks for `landmarks` in a keyframe: adds observations, and merges where the feature found shows another landmark.
-pub fn fuse(map: &mut Map, keyframe: usize, landmarks: &[usize], pinhole: &Pinhole, config: &TrackingConfig) {
+pub fn fuse(map: &mut Map, keyframe: usize, landmarks: &[usize], rig: &Rig) {
+    let Rig { pinhole, config } = rig;
     let target = &map.keyframes[keyframe];
-    let (mut asked, mut queries) = (Vec::new(), Vec::new());
-    for l in landmarks {
-        let landmark = &map.landmarks[*l];
-        if landmark.state != LandmarkState::Alive || landmark.seen_by(keyframe) {
-            continue;
-        }
-        let Some(seen) = map.predict(*l, &target.camera_from_world, pinhole, config) else { continue };
-        asked.push(*l);
-        queries.push(Query {
-            pixel: seen.pixel,
-            radius: FUSE_RADIUS * config.pyramid_scale.powi(seen.octave.into()),
-            octaves: seen.octave.saturating_sub(1)..=seen.octave,
-            descriptor: landmark.descriptor,
-            angle_rad: 0.0,
-            inverse_depth: seen.inverse_depth,
-        });
-    }
+    let unseen = |l: &usize| map.landmarks[*l].state == LandmarkState::Alive && !map.landmarks[*l].seen_by(keyframe);
+    let visible = map.visible(landmarks.iter().copied().filter(unseen), &target.camera_from_world, rig);
     let features = target.features.clone();
     let mut changed = BTreeSet::new();
-    for m in match_by_projection(&features, &[], &queries, &FUSE_RULES) {
-        let landmark = asked[m.query];
+    for PointMatch { point: landmark, feature } in FUSE_SEARCH.run(&features, &visible, |_| FUSE_RADIUS, rig) {
         let p_in_camera = (map.keyframes[keyframe].camera_from_world * map.landmarks[landmark].position).coords;
-        if features.features[m.feature].measurement(config).classify(pinhole, &p_in_camera) == InlierClass::Outlier {
+        if features.features[feature].measurement(config).classify(pinhole, &p_in_camera) == InlierClass::Outlier {
             continue;
         }
-        match map.keyframes[keyframe].landmarks[m.feature] {
+        match map.keyframes[keyframe].landmarks[feature] {
             None => {
-                map.add_observation(landmark, Observation { keyframe, feature: m.feature });
+                map.add_observation(landmark, Observation { keyframe, feature });
                 changed.insert(landmark);
             }
             Some(other) => {

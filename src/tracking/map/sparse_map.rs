@@ -6,13 +6,15 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use nalgebra::{Point3, Vector2, Vector3};
+use nalgebra::{Point3, Vector3};
 
-use crate::geometry::{Pinhole, Se3};
+use crate::geometry::Se3;
 use crate::tracking::TrackingConfig;
 use crate::tracking::features::descriptor::{Descriptor, representative};
 use crate::tracking::features::frame_features::FrameFeatures;
+use crate::tracking::features::projection::Projection;
 use crate::tracking::map::keyframe_database::KeyframeDatabase;
+use crate::tracking::rig::Rig;
 use crate::tracking::solvers::relative_pose::PoseMeasurement;
 
 /// A landmark is looked for only within 60° of the mean direction from which it was seen.
@@ -72,16 +74,6 @@ pub struct CulledKeyframe {
     /// A keyframe that has not been culled.
     pub parent: usize,
     pub camera_from_parent: Se3,
-}
-
-/// Where a landmark should appear.
-#[derive(Clone, Copy, Debug)]
-pub struct Prediction {
-    pub pixel: Vector2<f64>,
-    pub octave: u8,
-    /// Cosine between the line of sight and the landmark's mean one.
-    pub view_cosine: f64,
-    pub inverse_depth: f64,
 }
 
 #[derive(Clone, Debug, Default)]
@@ -201,14 +193,14 @@ impl Map {
         l.range = (furthest / scale(config.pyramid_levels - 1), furthest);
     }
 
-    /// Where a camera should see a landmark; `None` if it should not.
-    pub fn predict(
-        &self,
-        landmark: usize,
-        camera_from_world: &Se3,
-        pinhole: &Pinhole,
-        config: &TrackingConfig,
-    ) -> Option<Prediction> {
+    /// Projections of those landmarks that a camera should see, in their order; a projection's `point` is the landmark.
+    pub fn visible(&self, landmarks: impl IntoIterator<Item = usize>, camera_from_world: &Se3, rig: &Rig) -> Vec<Projection> {
+        landmarks.into_iter().filter_map(|landmark| self.predict(landmark, camera_from_world, rig)).collect()
+    }
+
+    /// Where a camera should see a landmark; `None` outside of its image, its range of distances or its viewing directions.
+    fn predict(&self, landmark: usize, camera_from_world: &Se3, rig: &Rig) -> Option<Projection> {
+        let Rig { pinhole, config } = rig;
         let l = &self.landmarks[landmark];
         let p_in_camera = (camera_from_world * l.position).coords;
         let pixel = pinhole.project(&p_in_camera).filter(|pixel| pinhole.contains(pixel, 0.0))?;
@@ -223,7 +215,15 @@ impl Map {
         }
         let octave = ((l.range.1 / distance).ln() / config.pyramid_scale.ln()).ceil();
         let octave = octave.clamp(0.0, config.pyramid_levels as f64 - 1.0) as u8;
-        Some(Prediction { pixel, octave, view_cosine, inverse_depth: 1.0 / p_in_camera.z })
+        Some(Projection {
+            point: landmark,
+            pixel,
+            octave,
+            view_cosine,
+            inverse_depth: 1.0 / p_in_camera.z,
+            descriptor: l.descriptor,
+            angle_rad: 0.0,
+        })
     }
 
     /// Keyframes that see the given landmarks and how many of them, most first, then newest first.
@@ -294,6 +294,8 @@ impl Keyframe {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use nalgebra::Vector2;
+
     use crate::tracking::features::frame_features::tests::feature;
     use crate::tracking::solvers::residual::tests::PINHOLE;
 
@@ -342,7 +344,7 @@ mod tests {
     fn a_landmark_is_predicted_where_and_how_large_it_was_seen() {
         let mut map = map();
         let id = map.add_landmark(at(0, 1), Point3::new(0.0, 0.0, 2.0), &config());
-        let predict = |pose: &Se3| map.predict(id, pose, &PINHOLE, &config());
+        let predict = |pose: &Se3| map.predict(id, pose, &Rig { pinhole: PINHOLE, config: config() });
         let here = predict(&Se3::identity()).unwrap();
         assert_eq!((here.octave, here.inverse_depth), (0, 0.5));
         assert!((here.pixel - Vector2::new(320.5, 241.0)).norm() < 1e-9);

@@ -8,6 +8,7 @@ use crate::geometry::{Pinhole, Se3};
 use crate::tracking::TrackingConfig;
 use crate::tracking::features::frame_features::Feature;
 use crate::tracking::map::sparse_map::{Keyframe, Map, Observation};
+use crate::tracking::rig::Rig;
 use crate::tracking::solvers::residual::InlierClass;
 
 /// Keyframes that a new one is matched with.
@@ -69,7 +70,8 @@ pub fn triangulate(a: &View<'_>, at_a: &Vector2<f64>, b: &View<'_>, at_b: &Vecto
 }
 
 /// Makes landmarks of what `keyframe` and the keyframes that share most with it see, and no landmark shows yet. Returns how many.
-pub fn triangulate_with_neighbours(map: &mut Map, keyframe: usize, pinhole: &Pinhole, config: &TrackingConfig) -> usize {
+pub fn triangulate_with_neighbours(map: &mut Map, keyframe: usize, rig: &Rig) -> usize {
+    let config = &rig.config;
     let neighbours: Vec<usize> = map.covisible(keyframe).into_iter().take(NEIGHBOURS).map(|(k, _)| k).collect();
     let mut made = 0;
     for neighbour in neighbours {
@@ -78,7 +80,7 @@ pub fn triangulate_with_neighbours(map: &mut Map, keyframe: usize, pinhole: &Pin
         if (this.centre() - other.centre()).norm() < MIN_BASELINE_SHARE * depth {
             continue;
         }
-        let pairs = match_along_lines(this, other, pinhole, config);
+        let pairs = match_along_lines(this, other, rig);
         for (mine, theirs, point) in pairs {
             let landmark = map.add_landmark(Observation { keyframe, feature: mine }, point, config);
             map.add_observation(landmark, Observation { keyframe: neighbour, feature: theirs });
@@ -90,12 +92,8 @@ pub fn triangulate_with_neighbours(map: &mut Map, keyframe: usize, pinhole: &Pin
 }
 
 /// Pairs of features without a landmark that show one point, and that point; each feature at most once.
-fn match_along_lines(
-    this: &Keyframe,
-    other: &Keyframe,
-    pinhole: &Pinhole,
-    config: &TrackingConfig,
-) -> Vec<(usize, usize, Point3<f64>)> {
+fn match_along_lines(this: &Keyframe, other: &Keyframe, rig: &Rig) -> Vec<(usize, usize, Point3<f64>)> {
+    let Rig { pinhole, config } = rig;
     let other_from_this = other.camera_from_world * this.camera_from_world.inverse();
     let fundamental = fundamental(&other_from_this, pinhole);
     let free = |k: &Keyframe| (0..k.features.len()).filter(|f| k.landmarks[*f].is_none()).collect::<Vec<usize>>();
@@ -111,8 +109,10 @@ fn match_along_lines(
         let Some((theirs, distance)) = best_on_line(feature, &line, other, &candidates, config) else { continue };
         let found = &other.features.features[theirs];
         let Some(met) = triangulate(&views.0, &feature.pixel, &views.1, &found.pixel) else { continue };
-        let agrees =
-            met.parallax_cosine < MAX_PARALLAX_COSINE && agree(&met.point, (feature, this), (found, other), pinhole, config);
+        let agrees = met.parallax_cosine < MAX_PARALLAX_COSINE && {
+            let mine = Observed { feature, keyframe: this };
+            agree(&met.point, &mine, &Observed { feature: found, keyframe: other }, rig)
+        };
         if agrees && taken[theirs].is_none_or(|(d, ..)| distance < d) {
             taken[theirs] = Some((distance, mine, met.point));
         }
@@ -150,19 +150,20 @@ fn best_on_line(
     best.filter(|(_, distance)| *distance <= MAX_DISTANCE && *distance as f32 <= RATIO * second as f32)
 }
 
+/// A feature of a keyframe.
+struct Observed<'a> {
+    feature: &'a Feature,
+    keyframe: &'a Keyframe,
+}
+
 /// Whether a point projects to both features, at distances that fit their sizes.
-fn agree(
-    point: &Point3<f64>,
-    a: (&Feature, &Keyframe),
-    b: (&Feature, &Keyframe),
-    pinhole: &Pinhole,
-    config: &TrackingConfig,
-) -> bool {
-    let projects = |(feature, keyframe): (&Feature, &Keyframe)| {
+fn agree(point: &Point3<f64>, a: &Observed<'_>, b: &Observed<'_>, rig: &Rig) -> bool {
+    let Rig { pinhole, config } = rig;
+    let projects = |Observed { feature, keyframe }: &Observed<'_>| {
         let trust = feature.measurement(config).classify(pinhole, &(keyframe.camera_from_world * point).coords);
         trust == InlierClass::Full || (trust == InlierClass::PixelOnly && feature.depth_metres.is_none())
     };
-    let size = |(feature, keyframe): (&Feature, &Keyframe)| {
+    let size = |Observed { feature, keyframe }: &Observed<'_>| {
         (point - keyframe.centre()).norm() / config.pyramid_scale.powi(feature.octave.into())
     };
     let ratio = size(a) / size(b);

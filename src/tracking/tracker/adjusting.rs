@@ -118,7 +118,7 @@ impl Tracker {
     fn take_in(&mut self, under_way: UnderWay, solved: &Adjustment, times: &mut StageTimes) -> Result<(), TrackingError> {
         let clock = Instant::now();
         self.adjusting.under_way = None;
-        self.moved.extend(solved.apply(&mut self.map, &self.config));
+        self.moved.extend(solved.apply(&mut self.map, &self.rig.config));
         times.bundle_ms += milliseconds(clock);
         if let Some(keyframe) = under_way.around {
             self.close_loops_and_cull(keyframe, times)?;
@@ -135,7 +135,7 @@ impl Tracker {
         let Some(Waiting { keyframe, held }) = self.adjusting.waiting.take() else { return Ok(()) };
         let clock = Instant::now();
         // A keyframe that few landmarks hold would be torn from where its pixels put it.
-        let window = held.then(|| Adjustment::of_window(&self.map, keyframe, &self.config)).flatten();
+        let window = held.then(|| Adjustment::of_window(&self.map, keyframe, &self.rig.config)).flatten();
         times.bundle_ms += milliseconds(clock);
         match window {
             Some(window) => self.begin(window, Some(keyframe)),
@@ -145,7 +145,7 @@ impl Tracker {
 
     fn begin(&mut self, adjustment: Adjustment, around: Option<usize>) -> Result<(), TrackingError> {
         self.adjusting.worker.give(adjustment)?;
-        let most = if self.sensor == Sensor::Mono { 1 } else { TAKEN_IN_AFTER };
+        let most = if self.front_end.sensor == Sensor::Mono { 1 } else { TAKEN_IN_AFTER };
         let later = (self.adjusting.interval / TAKEN_IN_SHARE).clamp(1, most);
         self.adjusting.under_way = Some(UnderWay { around, due: self.frames_seen + later });
         Ok(())
@@ -157,13 +157,13 @@ impl Tracker {
         let clock = Instant::now();
         let closed = self.close_loop(keyframe);
         times.loops_ms += milliseconds(clock);
-        if closed && let Some(all) = Adjustment::of_all(&self.map, &self.config) {
+        if closed && let Some(all) = Adjustment::of_all(&self.map, &self.rig.config) {
             return self.begin(all, None);
         }
         let clock = Instant::now();
-        if !closed && self.config.keyframe_culling {
-            cull_around(&mut self.map, keyframe, |k| self.loops.holds(k), &self.config);
-            self.reference = self.map.living(self.reference);
+        if !closed && self.rig.config.keyframe_culling {
+            cull_around(&mut self.map, keyframe, |k| self.loops.holds(k), &self.rig.config);
+            self.motion.reference = self.map.living(self.motion.reference);
         }
         times.mapping_ms += milliseconds(clock);
         Ok(())
@@ -171,15 +171,15 @@ impl Tracker {
 
     /// Closes a loop if a keyframe shows one, and says whether it did. Frames follow their keyframes.
     fn close_loop(&mut self, keyframe: usize) -> bool {
-        if !self.config.loop_closing {
+        if !self.rig.config.loop_closing {
             return false;
         }
-        let moved = self.loops.close(&mut self.map, keyframe, &self.camera.pinhole, &self.config);
+        let moved = self.loops.close(&mut self.map, keyframe, &self.rig);
         for crate::tracking::loop_closing::MovedKeyframe { keyframe, growth } in &moved {
             let theirs = self.records.iter_mut().filter(|r| r.reference == *keyframe);
             theirs.for_each(|r| r.camera_from_reference.translation.vector *= *growth);
-            if *keyframe == self.reference
-                && let Some(velocity) = &mut self.velocity
+            if *keyframe == self.motion.reference
+                && let Some(velocity) = &mut self.motion.velocity
             {
                 velocity.translation.vector *= *growth;
             }
@@ -191,7 +191,7 @@ impl Tracker {
 
     /// The last frame goes with the keyframe that holds it, and forgets landmarks that are no more.
     fn follow_keyframe(&mut self) {
-        let (Some(last), Some(record)) = (&mut self.last, self.records.last()) else { return };
+        let (Some(last), Some(record)) = (&mut self.motion.last, self.records.last()) else { return };
         let keyframe = &self.map.keyframes[record.reference];
         last.camera_from_world = record.camera_from_reference * keyframe.camera_from_world;
         if record.frame_index == keyframe.frame_index {

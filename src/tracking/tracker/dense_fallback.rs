@@ -24,29 +24,29 @@ impl Tracker {
         last: &LastFrame,
         guess: Option<Se3>,
     ) -> Option<Localised> {
-        if self.frames_lost > MAX_FRAMES_BRIDGED {
+        if self.lostness.frames_lost > MAX_FRAMES_BRIDGED {
             return None;
         }
-        let (frame, before) = (dense?, self.dense_last.as_ref()?);
-        let mut guesses = vec![self.velocity.unwrap_or_default(), Se3::identity()];
+        let (frame, before) = (dense?, self.dense.last.as_ref()?);
+        let mut guesses = vec![self.motion.velocity.unwrap_or_default(), Se3::identity()];
         guesses.extend(guess.map(|pose| pose * last.camera_from_world.inverse()));
         let mut camera_from_world = align(before, frame, &guesses)?.current_from_reference * last.camera_from_world;
-        if let Some((keyframe, view)) = &self.dense_keyframe {
+        if let Some((keyframe, view)) = &self.dense.keyframe {
             let pose = self.map.keyframes[*keyframe].camera_from_world;
             let guess = camera_from_world * pose.inverse();
             if let Some(found) = align(view, frame, &[guess]).filter(|found| found.overlap >= KEYFRAME_OVERLAP) {
                 camera_from_world = found.current_from_reference * pose;
             }
         }
-        let mut context = Context { map: &mut self.map, pinhole: &self.camera.pinhole, config: &self.config };
-        Some(context.at_pose(features, camera_from_world, self.reference))
+        let mut context = Context { map: &mut self.map, rig: &self.rig };
+        Some(context.at_pose(features, camera_from_world, self.motion.reference))
     }
 
     /// Keeps a tracked frame's pixels for the next.
     pub(super) fn keep_dense(&mut self, dense: Option<Arc<DenseFrame>>, is_keyframe: bool) {
         if is_keyframe {
-            self.dense_keyframe = dense.clone().map(|view| (self.map.keyframes.len() - 1, view));
+            self.dense.keyframe = dense.clone().map(|view| (self.map.keyframes.len() - 1, view));
         }
-        self.dense_last = dense;
+        self.dense.last = dense;
     }
 }

@@ -17,7 +17,7 @@ use adjusting::Adjusting;
 use crate::geometry::{Camera, Se3, StampedPose};
 use crate::sequence::{Frame, Sensor};
 use crate::tracking::adjustment::thread::Worker;
-use crate::tracking::features::frame_features::{FrameFeatures, luma};
+use crate::tracking::features::frame_features::{FrameFeatures, FrontEnd, luma};
 use crate::tracking::features::orb::Extractor;
 use crate::tracking::initialisation::mono::FirstView;
 use crate::tracking::localisation::dense_alignment::{DenseFrame, DenseSampler};
@@ -26,6 +26,7 @@ use crate::tracking::loop_closing::LoopCloser;
 use crate::tracking::map::insertion;
 use crate::tracking::map::sparse_map::{Keyframe, Map};
 use crate::tracking::map::triangulation;
+use crate::tracking::rig::Rig;
 use crate::tracking::{KeyframePose, NewKeyframe, StageTimes, TrackedFrame, TrackingConfig, TrackingError, TrackingState};
 
 /// For this many frames after the camera was found again, poses are held to the stricter count.
@@ -42,33 +43,51 @@ const MIN_INLIER_SHARE: f64 = 0.35;
 /// The tracker, for any sensor.
 #[derive(Debug)]
 pub struct Tracker {
-    camera: Camera,
-    sensor: Sensor,
-    config: TrackingConfig,
-    extractor: Extractor,
+    rig: Rig,
+    front_end: FrontEnd,
     map: Map,
     loops: LoopCloser,
-    /// The last frame with a pose; `None` before the map is started.
-    last: Option<LastFrame>,
     /// The frame that a map without depth may start from.
     first_view: Option<FirstView>,
-    /// camera_from_last_camera, as of the last two frames in a row.
+    motion: Motion,
+    lostness: Lostness,
+    dense: DenseState,
+    frames_seen: usize,
+    records: Vec<Record>,
+    adjusting: Adjusting,
+    /// Keyframes that moved since the last tracked frame.
+    moved: BTreeSet<usize>,
+}
+
+/// The last pose and the constant-velocity motion model.
+#[derive(Debug, Default)]
+struct Motion {
+    /// The last frame with a pose; `None` before the map is started.
+    last: Option<LastFrame>,
+    /// camera_from_last_camera of the last two consecutive frames.
     velocity: Option<Se3>,
     /// Keyframe that shares most landmarks with the last frame.
     reference: usize,
-    lost: bool,
-    /// In a row, until now.
+}
+
+/// Whether the camera is lost, and for how long.
+#[derive(Debug)]
+struct Lostness {
+    is_lost: bool,
+    /// Consecutive frames without a pose.
     frames_lost: usize,
+    /// Frames with a pose since relocalisation.
     frames_since_found: usize,
-    frames_seen: usize,
-    /// For RGB-D: the last tracked frame and the newest keyframe as [`align`] takes them.
+}
+
+/// Reference frames of dense RGB-D alignment.
+#[derive(Debug)]
+struct DenseState {
+    /// `None` for other sensors.
     sampler: Option<DenseSampler>,
-    dense_last: Option<Arc<DenseFrame>>,
-    dense_keyframe: Option<(usize, Arc<DenseFrame>)>,
-    records: Vec<Record>,
-    adjusting: Adjusting,
-    /// Keyframes that moved since the last frame's answer.
-    moved: BTreeSet<usize>,
+    last: Option<Arc<DenseFrame>>,
+    /// The newest keyframe's id and pixels.
+    keyframe: Option<(usize, Arc<DenseFrame>)>,
 }
 
 /// A tracked frame, held by its reference keyframe.
@@ -88,29 +107,27 @@ impl Tracker {
     pub fn new(camera: Camera, sensor: Sensor, config: &TrackingConfig) -> Result<Self, TrackingError> {
         config.validate().map_err(TrackingError::Config)?;
         let spacing = if sensor == Sensor::Mono { MONO_SPACING } else { 1.0 };
+        let pinhole = camera.pinhole;
         let config = TrackingConfig {
             keyframe_translation: spacing * config.keyframe_translation,
             keyframe_rotation_rad: spacing * config.keyframe_rotation_rad,
             ..config.clone()
         };
-        let worker = Worker::start(camera.pinhole, config.bundle_iterations)?;
+        let worker = Worker::start(pinhole, config.bundle_iterations)?;
+        let extractor = Extractor::new(pinhole.width, pinhole.height, &config);
         Ok(Self {
-            camera,
-            sensor,
-            extractor: Extractor::new(camera.pinhole.width, camera.pinhole.height, &config),
-            config,
+            dense: DenseState {
+                sampler: (sensor == Sensor::Rgbd).then(|| DenseSampler::new(&camera)),
+                last: None,
+                keyframe: None,
+            },
+            rig: Rig { pinhole, config },
+            front_end: FrontEnd { camera, sensor, extractor },
             map: Map::default(),
             loops: LoopCloser::default(),
-            last: None,
             first_view: None,
-            velocity: None,
-            reference: 0,
-            lost: false,
-            frames_lost: 0,
-            sampler: (sensor == Sensor::Rgbd).then(|| DenseSampler::new(&camera)),
-            dense_last: None,
-            dense_keyframe: None,
-            frames_since_found: FRESHLY_FOUND_FRAMES,
+            motion: Motion::default(),
+            lostness: Lostness { is_lost: false, frames_lost: 0, frames_since_found: FRESHLY_FOUND_FRAMES },
             frames_seen: 0,
             records: Vec::new(),
             adjusting: Adjusting::new(worker),
@@ -137,15 +154,14 @@ impl Tracker {
         let mut times = StageTimes::default();
         let clock = Instant::now();
         let grey = luma(&frame.color);
-        let setting = (&self.camera, self.sensor);
-        let features = Arc::new(FrameFeatures::of_frame((frame, &grey), setting, &self.extractor, &self.config)?);
-        let sampled = self.sampler.as_ref().zip(frame.depth.as_ref());
-        let dense = sampled.map(|(sampler, depth)| Arc::new(sampler.sample(&grey, depth, &self.config)));
+        let features = Arc::new(self.front_end.features(frame, &grey, &self.rig.config)?);
+        let sampled = self.dense.sampler.as_ref().zip(frame.depth.as_ref());
+        let dense = sampled.map(|(sampler, depth)| Arc::new(sampler.sample(&grey, depth, &self.rig.config)));
         times.features_ms = milliseconds(clock);
         self.take_adjusted(&mut times)?;
-        let mut tracked = match self.last.take() {
+        let mut tracked = match self.motion.last.take() {
             Some(last) => self.go_on(frame, features, dense.as_deref(), last, may_be_keyframe, times)?,
-            None if self.sensor == Sensor::Mono => self.start_without_depth(frame, features, may_be_keyframe, times),
+            None if self.front_end.sensor == Sensor::Mono => self.start_without_depth(frame, features, may_be_keyframe, times),
             None => self.start(frame, features, may_be_keyframe, times),
         };
         if tracked.state == TrackingState::Tracking {
@@ -175,10 +191,10 @@ impl Tracker {
         if let Some(found) = found {
             return self.accept(frame, features, &last, found, may_be_keyframe, times);
         }
-        self.last = Some(last);
-        self.frames_lost += 1;
-        self.lost = true;
-        self.velocity = None;
+        self.motion.last = Some(last);
+        self.lostness.frames_lost += 1;
+        self.lostness.is_lost = true;
+        self.motion.velocity = None;
         Ok(TrackedFrame::lost(times))
     }
 
@@ -209,7 +225,7 @@ impl Tracker {
     }
 
     fn check(&self, frame: &Frame) -> Result<(), TrackingError> {
-        let (width, height) = (self.camera.pinhole.width, self.camera.pinhole.height);
+        let (width, height) = (self.rig.pinhole.width, self.rig.pinhole.height);
         let size = |what, (found_width, found_height)| {
             let good = (found_width, found_height) == (width, height);
             let error = TrackingError::Size { frame: frame.index, what, width, height, found_width, found_height };
@@ -218,7 +234,7 @@ impl Tracker {
         size("colour", frame.color.dimensions())?;
         match &frame.depth {
             Some(depth) => size("depth", (depth.width, depth.height)),
-            None if self.frames_seen == 0 && self.sensor == Sensor::Rgbd => {
+            None if self.frames_seen == 0 && self.front_end.sensor == Sensor::Rgbd => {
                 Err(TrackingError::FirstFrameWithoutDepth { frame: frame.index })
             }
             None => Ok(()),
@@ -227,13 +243,13 @@ impl Tracker {
 
     /// The frame's pose, if it can be trusted.
     fn localise(&mut self, features: &FrameFeatures, last: &LastFrame) -> Option<Localised> {
-        let strict = self.lost || self.frames_since_found < FRESHLY_FOUND_FRAMES;
-        let needed = if strict { self.config.min_relocalisation_inliers } else { self.config.min_inliers };
-        let reference = self.reference;
-        let predicted = self.velocity.unwrap_or_default() * last.camera_from_world;
-        let mut context = Context { map: &mut self.map, pinhole: &self.camera.pinhole, config: &self.config };
+        let strict = self.lostness.is_lost || self.lostness.frames_since_found < FRESHLY_FOUND_FRAMES;
+        let needed = if strict { self.rig.config.min_relocalisation_inliers } else { self.rig.config.min_inliers };
+        let reference = self.motion.reference;
+        let predicted = self.motion.velocity.unwrap_or_default() * last.camera_from_world;
+        let mut context = Context { map: &mut self.map, rig: &self.rig };
         let mut found = None;
-        if !self.lost {
+        if !self.lostness.is_lost {
             let view = context.view_of_last(last);
             if let Some(start) = context.with_motion_model(features, &view, &predicted) {
                 found = Some(context.in_local_map(features, &start, reference)).filter(|f| f.inliers >= needed);
@@ -247,7 +263,7 @@ impl Tracker {
             }
         }
         if found.is_none() {
-            let needed = self.config.min_relocalisation_inliers;
+            let needed = self.rig.config.min_relocalisation_inliers;
             found = context.relocalise(features, reference).filter(|f| f.inliers >= needed);
         }
         let trusted = |f: &Localised| {
@@ -267,21 +283,22 @@ impl Tracker {
         may_be_keyframe: bool,
         mut times: StageTimes,
     ) -> Result<TrackedFrame, TrackingError> {
-        self.frames_since_found = if self.lost { 0 } else { self.frames_since_found + 1 };
-        self.velocity = (!self.lost).then(|| found.camera_from_world * last.camera_from_world.inverse());
-        self.lost = false;
-        self.frames_lost = 0;
+        self.lostness.frames_since_found = if self.lostness.is_lost { 0 } else { self.lostness.frames_since_found + 1 };
+        self.motion.velocity = (!self.lostness.is_lost).then(|| found.camera_from_world * last.camera_from_world.inverse());
+        self.lostness.is_lost = false;
+        self.lostness.frames_lost = 0;
         let covisibility = self.map.covisibility(found.landmarks.iter().flatten().copied());
-        self.reference = covisibility.first().map_or(self.reference, |(k, _)| *k);
-        let due = may_be_keyframe && keyframe_selection::is_due(&self.map, &features, &found, self.reference, &self.config);
+        self.motion.reference = covisibility.first().map_or(self.motion.reference, |(k, _)| *k);
+        let due =
+            may_be_keyframe && keyframe_selection::is_due(&self.map, &features, &found, self.motion.reference, &self.rig.config);
         let Localised { camera_from_world, landmarks, inliers, dense, .. } = found;
-        let camera_from_reference = camera_from_world * self.map.keyframes[self.reference].camera_from_world.inverse();
-        self.record(frame, self.reference, camera_from_reference);
-        self.last = Some(LastFrame { features, camera_from_world, landmarks });
+        let camera_from_reference = camera_from_world * self.map.keyframes[self.motion.reference].camera_from_world.inverse();
+        self.record(frame, self.motion.reference, camera_from_reference);
+        self.motion.last = Some(LastFrame { features, camera_from_world, landmarks });
         let new_keyframe = if due { self.make_keyframe(frame, !dense, &mut times)? } else { None };
         Ok(TrackedFrame {
             state: TrackingState::Tracking,
-            world_from_camera: self.last.as_ref().map(|l| l.camera_from_world.inverse()),
+            world_from_camera: self.motion.last.as_ref().map(|l| l.camera_from_world.inverse()),
             inliers,
             keyframe: new_keyframe,
             updates: Vec::new(),
@@ -292,8 +309,7 @@ impl Tracker {
     /// Makes the frame that was just tracked a keyframe. `held`: by landmarks, instead of by all pixels.
     fn make_keyframe(&mut self, frame: &Frame, held: bool, times: &mut StageTimes) -> Result<Option<NewKeyframe>, TrackingError> {
         self.settle_for_keyframe(times)?;
-        let Some(LastFrame { features, camera_from_world, landmarks }) = self.last.take() else { return Ok(None) };
-        let (pinhole, config) = (&self.camera.pinhole, &self.config);
+        let Some(LastFrame { features, camera_from_world, landmarks }) = self.motion.last.take() else { return Ok(None) };
         let clock = Instant::now();
         let keyframe = Keyframe {
             frame_index: frame.index,
@@ -302,15 +318,15 @@ impl Tracker {
             features: features.clone(),
             landmarks,
         };
-        let id = insertion::insert_keyframe(&mut self.map, keyframe, pinhole, config);
-        triangulation::triangulate_with_neighbours(&mut self.map, id, pinhole, config);
-        insertion::fuse_with_neighbours(&mut self.map, id, pinhole, config);
+        let id = insertion::insert_keyframe(&mut self.map, keyframe, &self.rig);
+        triangulation::triangulate_with_neighbours(&mut self.map, id, &self.rig);
+        insertion::fuse_with_neighbours(&mut self.map, id, &self.rig);
         insertion::cull_recent_landmarks(&mut self.map, id);
         times.mapping_ms += milliseconds(clock);
-        self.reference = id;
+        self.motion.reference = id;
         self.records.pop();
         self.record(frame, id, Se3::identity());
-        self.last = Some(LastFrame { features, camera_from_world, landmarks: self.map.keyframes[id].landmarks.clone() });
+        self.motion.last = Some(LastFrame { features, camera_from_world, landmarks: self.map.keyframes[id].landmarks.clone() });
         self.adjust_around(id, held, times)?;
         // Its pose goes out with itself.
         self.moved.remove(&id);
@@ -322,7 +338,7 @@ impl Tracker {
         let keyframe = &self.map.keyframes[id];
         let depth = |l: usize| (keyframe.camera_from_world * self.map.landmarks[l].position).z;
         let pairs = keyframe.features.features.iter().zip(&keyframe.landmarks);
-        let seen = match self.sensor {
+        let seen = match self.front_end.sensor {
             Sensor::Rgbd => Vec::new(),
             _ => pairs.filter_map(|(f, l)| l.map(|l| (f.pixel, depth(l)))).filter(|(_, z)| *z > 0.0).collect(),
         };

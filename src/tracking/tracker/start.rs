@@ -6,7 +6,7 @@ use super::{Record, Tracker};
 use crate::geometry::Se3;
 use crate::sequence::Frame;
 use crate::tracking::features::frame_features::FrameFeatures;
-use crate::tracking::initialisation::mono::{self, FirstView};
+use crate::tracking::initialisation::mono::{self, FirstView, SecondView};
 use crate::tracking::localisation::localise::LastFrame;
 use crate::tracking::map::insertion;
 use crate::tracking::map::sparse_map::Keyframe;
@@ -16,7 +16,7 @@ impl Tracker {
     /// Starts the map with a frame that shows enough.
     pub(super) fn start(&mut self, frame: &Frame, features: Arc<FrameFeatures>, may: bool, times: StageTimes) -> TrackedFrame {
         let with_depth = features.features.iter().filter(|f| f.depth_metres.is_some()).count();
-        if !may || with_depth < self.config.min_initial_landmarks {
+        if !may || with_depth < self.rig.config.min_initial_landmarks {
             return TrackedFrame::lost(times);
         }
         let keyframe = Keyframe {
@@ -26,9 +26,9 @@ impl Tracker {
             features: features.clone(),
             landmarks: Vec::new(),
         };
-        let id = insertion::insert_keyframe(&mut self.map, keyframe, &self.camera.pinhole, &self.config);
+        let id = insertion::insert_keyframe(&mut self.map, keyframe, &self.rig);
         let landmarks = self.map.keyframes[id].landmarks.clone();
-        self.last = Some(LastFrame { features, camera_from_world: Se3::identity(), landmarks });
+        self.motion.last = Some(LastFrame { features, camera_from_world: Se3::identity(), landmarks });
         self.record(frame, id, Se3::identity());
         TrackedFrame {
             state: TrackingState::Tracking,
@@ -51,14 +51,13 @@ impl Tracker {
         if !may {
             return TrackedFrame::lost(times);
         }
-        let (pinhole, config) = (&self.camera.pinhole, &self.config);
-        let matches = self.first_view.as_mut().and_then(|first| first.follow(&features, pinhole));
+        let matches = self.first_view.as_mut().and_then(|first| first.follow(&features, &self.rig.pinhole));
         let (Some(first), Some(matches)) = (&self.first_view, matches) else {
             self.first_view = Some(FirstView::new(frame.index, frame.timestamp_s, features));
             return TrackedFrame::lost(times);
         };
-        let this = (frame.index, frame.timestamp_s, &features);
-        let Some(map) = mono::first_map(first, this, &matches, pinhole, config) else { return TrackedFrame::lost(times) };
+        let second = SecondView { frame_index: frame.index, timestamp_s: frame.timestamp_s, features: &features };
+        let Some(map) = mono::first_map(first, &second, &matches, &self.rig) else { return TrackedFrame::lost(times) };
         self.map = map;
         self.first_view = None;
         let keyframes = self.keyframes();
@@ -68,10 +67,10 @@ impl Tracker {
             self.records.push(Record { frame_index, timestamp_s, reference, camera_from_reference: Se3::identity() });
         }
         let (id, world_from_camera) = (second.id, second.world_from_camera);
-        self.reference = id;
+        self.motion.reference = id;
         let landmarks = self.map.keyframes[id].landmarks.clone();
         let inliers = landmarks.iter().flatten().count();
-        self.last = Some(LastFrame { features, camera_from_world: world_from_camera.inverse(), landmarks });
+        self.motion.last = Some(LastFrame { features, camera_from_world: world_from_camera.inverse(), landmarks });
         TrackedFrame {
             state: TrackingState::Tracking,
             world_from_camera: Some(world_from_camera),

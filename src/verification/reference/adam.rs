@@ -9,9 +9,18 @@ pub struct Adam64 {
     pub average: Vec<f64>,
 }
 
+/// Decay of the moments, and the denominator's offset.
+#[derive(Clone, Copy, Debug)]
+pub struct Decay64 {
+    pub beta_1: f64,
+    pub beta_2: f64,
+    pub epsilon: f64,
+}
+
 impl Adam64 {
     /// Moves `parameters` by `gradient`; a gradient that is zero throughout moves nothing and counts no step.
-    pub fn step(&mut self, parameters: &mut [f64], gradient: &[f64], rates: &[f64], (beta_1, beta_2, epsilon): (f64, f64, f64)) {
+    pub fn step(&mut self, parameters: &mut [f64], gradient: &[f64], rates: &[f64], decay: Decay64) {
+        let Decay64 { beta_1, beta_2, epsilon } = decay;
         if gradient.iter().all(|g| *g == 0.0) {
             return;
         }

@@ -129,7 +129,7 @@ fn moved_run(machine: &Machine, rng: &mut Rng, new_from_old: &Se3, scale: f64, e
     let after = run(machine, &there, &elsewhere, &scaled_loss)?;
     let mut outcome = Outcome::default();
     let limited = |limit| if expected == Expected::Anything { f64::INFINITY } else { limit };
-    compare_gradients(&mut outcome, &before, &after, (new_from_old, scale), limited(GRADIENT_LIMIT));
+    compare_gradients(&mut outcome, &before, &after, &new_from_old.rotation, scale, limited(GRADIENT_LIMIT));
     let [last, last_there] = [&before, &after].map(|run| run.losses[STEPS - 1]);
     outcome.note("loss at the end, of the first", last / before.losses[0]);
     if expected == Expected::Same {
@@ -180,8 +180,7 @@ fn distance(a: &GaussianCloud, b: &GaussianCloud) -> f64 {
 
 /// The gradient there, brought home: by positions it turns with the world and shrinks with its size, by quaternions it is multiplied by
 /// the turn, as they are.
-fn compare_gradients(outcome: &mut Outcome, home: &Run, there: &Run, (new_from_old, scale): (&Se3, f64), limit: f64) {
-    let turn = new_from_old.rotation;
+fn compare_gradients(outcome: &mut Outcome, home: &Run, there: &Run, turn: &UnitQuaternion<f64>, scale: f64, limit: f64) {
     let unturned = |q: &Vector4<f64>| {
         let q = turn.quaternion().conjugate() * nalgebra::Quaternion::new(q[0], q[1], q[2], q[3]);
         Vector4::new(q.w, q.i, q.j, q.k)

@@ -102,7 +102,14 @@ fn check(machine: &Machine, rng: &mut Rng, scene: &Scene, limits: [f64; 2]) -> R
     let (view, wide) = (view64(scene), cloud64(&scene.cloud));
     let is_trusted = |pixel: &Conditioning| pixel.near_cutoffs == 0 && pixel.exponent_error < UNCERTAIN;
     let trusted: Vec<bool> = pixel_conditioning(&view, &wide, BAND).iter().map(is_trusted).collect();
-    compare(machine, rng, scene, (&view, &wide, &trusted), limits)
+    compare(machine, rng, scene, &Expected { view: &view, gaussians: &wide, trusted: &trusted }, limits)
+}
+
+/// The oracle's input, and the pixels whose values rounding cannot change much.
+struct Expected<'a> {
+    view: &'a View64,
+    gaussians: &'a [Gaussian64],
+    trusted: &'a [bool],
 }
 
 /// Renders the scene and pulls a random gradient back, on the GPU and by the oracle, whose view and map may be another's.
@@ -110,9 +117,10 @@ fn compare(
     machine: &Machine,
     rng: &mut Rng,
     scene: &Scene,
-    (view, wide, trusted): (&View64, &[Gaussian64], &[bool]),
+    expected: &Expected<'_>,
     [image_limit, gradient_limit]: [f64; 2],
 ) -> Result<Outcome, GpuError> {
+    let Expected { view, gaussians: wide, trusted } = *expected;
     let mut outcome = Outcome::default();
     outcome.count("pixels", trusted.len());
     outcome.count("left out", trusted.iter().filter(|t| !**t).count());
@@ -143,7 +151,8 @@ fn shifted(machine: &Machine, rng: &mut Rng, metres: f64) -> Result<Outcome, Gpu
     let pixels = (scene.camera.pinhole.width * scene.camera.pinhole.height) as usize;
     let (view, wide) = (view64(&scene), cloud64(&scene.cloud));
     let limits = [f64::INFINITY, f64::INFINITY];
-    let mut outcome = compare(machine, rng, &there, (&view, &wide, &vec![true; pixels]), limits)?;
+    let mut outcome =
+        compare(machine, rng, &there, &Expected { view: &view, gaussians: &wide, trusted: &vec![true; pixels] }, limits)?;
     let on_gpu = machine.upload(&there.cloud)?;
     let rendered = machine.with(0, |trainer| trainer.render(&on_gpu, &there.camera, BACKGROUND))?;
     outcome.note("colours against home, RMS", rms(&rendered, &rasterize_forward::render(&view, &wide)));
