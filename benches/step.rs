@@ -5,7 +5,7 @@ use std::cell::RefCell;
 use std::time::Duration;
 
 use criterion::{Criterion, criterion_group, criterion_main};
-use keysplat::bench::{BenchScene, StepRunner, StepTimes};
+use keysplat::calibration::{BenchScene, StepRunner, StepTimes};
 use keysplat::gpu::{Gpu, GpuError};
 use keysplat::render::BlendForm;
 use keysplat::splat::ShDegree;

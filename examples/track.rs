@@ -1,7 +1,7 @@
 //! Tracks a recorded sequence and says how well: `track <sequence folder> [trajectory.txt] [key=value …]` prints frames tracked,
 //! keyframes, ATE RMSE after alignment (with scale for one camera alone), and the time per frame by stage. `key=value` sets a field of the
 //! tracking config; `sensor=mono` leaves depth or the right eye out, `every=N` takes every N-th frame, `hold_out=N` lets no N-th frame become a keyframe,
-//! `paced=true` takes bundle adjustment in when it is ready, as a paced run does (though frames come as fast as they are tracked).
+//! `real_time=true` applies bundle adjustment when it is ready, as a real-time run does, though frames come as fast as they are tracked.
 
 use std::error::Error;
 use std::path::Path;
@@ -17,8 +17,8 @@ fn main() -> Result<(), Box<dyn Error>> {
     let folder = paths.first().ok_or("usage: track <sequence folder> [trajectory.txt] [key=value …]")?;
     let number = |key: &str| settings.iter().find_map(|s| s.strip_prefix(key)).map(str::parse::<usize>).transpose();
     let (every, hold_out) = (number("every=")?.unwrap_or(1), number("hold_out=")?.unwrap_or(usize::MAX));
-    let paced = settings.iter().any(|s| s == "paced=true");
-    let own = |s: &&String| !["sensor=", "every=", "hold_out=", "paced="].iter().any(|key| s.starts_with(key));
+    let real_time = settings.iter().any(|s| s == "real_time=true");
+    let own = |s: &&String| !["sensor=", "every=", "hold_out=", "real_time="].iter().any(|key| s.starts_with(key));
     let config: TrackingConfig = toml::from_str(&settings.iter().filter(own).cloned().collect::<Vec<_>>().join("\n"))?;
     let mut sequence = Sequence::open(Path::new(folder), None, None)?;
     if let Some(kind) = settings.iter().find_map(|s| s.strip_prefix("sensor=")) {
@@ -26,7 +26,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     }
     let sensor = sequence.sensor.kind();
     sequence.select(None, every)?;
-    let mut tracker = Tracker::new(sequence.camera, sequence.sensor, &config)?.paced(paced);
+    let mut tracker = Tracker::new(sequence.camera, sequence.sensor, &config)?.real_time(real_time);
     let (mut times, mut lost, mut inliers) = (Vec::<StageTimes>::new(), Vec::new(), Vec::new());
     let mut shared = Vec::new();
     for index in 0..sequence.entries.len() {

@@ -15,7 +15,7 @@
 // (by mean, by square, by product) of one channel filtered along rows: [26 rows, 16 columns].
 var<workgroup> rows: array<vec4<f32>, 416>;
 
-// A workgroup covers 16×16 pixels: two tiles, whose gradients nobody asks for if both are left out.
+// A workgroup covers 16×16 pixels: two tiles, whose gradients are not needed if neither is sampled.
 @compute @workgroup_size(64)
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,

@@ -9,7 +9,7 @@ use crate::mapping::MappingConfig;
 use crate::sequence::{Layout, SensorKind};
 use crate::tracking::TrackingConfig;
 
-/// Everything that a run can be told. Written resolved beside its outputs, where it is a valid configuration again.
+/// Configuration of a run: every setting of all modules. `config.toml` in the run folder is the resolved one, and can be used again.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Config {
@@ -26,8 +26,11 @@ pub struct Config {
     /// Keyframes mapped, and rounds of the refinement, between two checkpoints; none are kept where absent.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub checkpoint_every: Option<usize>,
+    /// Frame selection, sensor and replay mode.
     pub replay: ReplayConfig,
+    /// Tracker settings.
     pub tracking: TrackingConfig,
+    /// Mapper settings.
     pub mapping: MappingConfig,
 }
 
@@ -93,12 +96,26 @@ impl ReplayConfig {
     }
 }
 
+/// A configuration that cannot be read or used.
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
+    /// The file cannot be read.
     #[error("cannot read the configuration {path}: {source}")]
-    Read { path: PathBuf, source: std::io::Error },
+    Read {
+        /// The file or folder.
+        path: PathBuf,
+        /// The cause.
+        source: std::io::Error,
+    },
+    /// Not TOML, an unknown key, or a value of the wrong type.
     #[error("{path}: {source}")]
-    Syntax { path: PathBuf, source: Box<toml::de::Error> },
+    Syntax {
+        /// The file or folder.
+        path: PathBuf,
+        /// The cause.
+        source: Box<toml::de::Error>,
+    },
+    /// A value out of its range; the message names key and range.
     #[error("{0}")]
     Value(String),
     /// A key of an earlier version.
@@ -111,7 +128,12 @@ pub enum ConfigError {
     },
     /// An error in a file.
     #[error("{path}: {source}")]
-    In { path: PathBuf, source: Box<ConfigError> },
+    In {
+        /// The file or folder.
+        path: PathBuf,
+        /// The cause.
+        source: Box<ConfigError>,
+    },
 }
 
 /// Dotted keys of earlier versions, and those that replaced them; keys of a section before the section itself.
@@ -188,17 +210,26 @@ impl Config {
 
     /// Reads and checks a TOML file; keys that it leaves out keep their defaults, unknown ones are errors. The defaults are those of
     /// [`Self::offline`] if the file says that poses are known.
+    ///
+    /// # Errors
+    /// [`ConfigError`] if the file cannot be read or parsed, has an unknown or renamed key, or a value out of range.
     pub fn read(path: &Path) -> Result<Self, ConfigError> {
         Self::read_with(path, false)
     }
 
     /// The same; `known_poses` says it, whatever the file does.
+    ///
+    /// # Errors
+    /// As [`Self::read`].
     pub fn read_with(path: &Path, known_poses: bool) -> Result<Self, ConfigError> {
         let text = std::fs::read_to_string(path).map_err(|source| ConfigError::Read { path: path.into(), source })?;
         Self::parse(&text, path, known_poses)
     }
 
     /// The same of a text; `path` is named in errors.
+    ///
+    /// # Errors
+    /// As [`Self::read`], except for reading.
     pub fn parse(text: &str, path: &Path, known_poses: bool) -> Result<Self, ConfigError> {
         let syntax = |source| ConfigError::Syntax { path: path.into(), source: Box::new(source) };
         let in_file = |source| ConfigError::In { path: path.into(), source: Box::new(source) };
@@ -215,6 +246,9 @@ impl Config {
     }
 
     /// The same with single values changed, each written `key.of.value=value` as in TOML; a bare word counts as text. Checked.
+    ///
+    /// # Errors
+    /// [`ConfigError::Value`] if a setting is no `key=value`, names no key, or is out of range; [`ConfigError::Renamed`] for a key of an earlier version.
     pub fn with_settings<S: AsRef<str>>(&self, settings: &[S]) -> Result<Self, ConfigError> {
         if settings.is_empty() {
             self.validate()?;
@@ -246,6 +280,9 @@ impl Config {
     }
 
     /// Checks all values.
+    ///
+    /// # Errors
+    /// [`ConfigError::Value`] with the first key that is out of range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         let value = |message: String| Err(ConfigError::Value(message));
         if !(self.map_scale > 0.0 && self.map_scale <= 1.0) {

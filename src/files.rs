@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 #[derive(Debug, thiserror::Error)]
 #[error("cannot write {path}: {source}; {advice}", advice = advice(source.kind()))]
 pub struct WriteError {
-    /// The file that was asked for, not the temporary one beside it.
+    /// The requested file, not the temporary one beside it.
     pub path: PathBuf,
     /// The system's error.
     pub source: std::io::Error,
@@ -25,11 +25,17 @@ fn advice(kind: ErrorKind) -> &'static str {
 
 /// Writes a file so that it is never seen half-written: under another name in the same folder first, then renamed. Replaces what
 /// was there. Not flushed to the disk itself: a power cut may still lose it.
+///
+/// # Errors
+/// [`WriteError`] if the folder does not exist, the disk is full, or writing is not permitted.
 pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), WriteError> {
     write(path, bytes, |_| Ok(()))
 }
 
 /// The same, flushed to the disk itself: after a power cut either the new file or the old one is there.
+///
+/// # Errors
+/// As [`write_atomically`].
 pub fn write_durably(path: &Path, bytes: &[u8]) -> Result<(), WriteError> {
     write(path, bytes, std::fs::File::sync_all)?;
     // The rename is the folder's to keep; not every system opens folders as files.

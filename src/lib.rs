@@ -4,7 +4,7 @@
 //! alone. The modules below it are public for programs that track, map, render or evaluate by themselves. `ARCHITECTURE.md` draws the whole,
 //! `CONVENTIONS.md` defines frames, units and names.
 
-pub mod bench;
+pub mod calibration;
 pub mod config;
 pub mod evaluation;
 pub mod export;

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use crate::bench::{BenchScene, StepRunner};
+use crate::calibration::{BenchScene, StepRunner};
 use crate::config::Config;
 use crate::gpu::{Gpu, GpuError};
 use crate::recording::Recording;

@@ -71,7 +71,7 @@ fn bordered(size: u32) -> u32 {
     return (size + 15u) / 16u * 16u + 2u * RADIUS;
 }
 
-// What every part of the loss is told; host twin: `optimise::loss::LossSetup`.
+// Weights of every part of the loss; host twin: `optimise::loss::LossSetup`.
 struct LossSetup {
     width: u32,
     height: u32,

@@ -6,7 +6,7 @@ mod sweep;
 use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand, ValueEnum};
-use keysplat::bench::{BenchScene, Rates, StepBench, StepReport, bench_step, measure_rates};
+use keysplat::calibration::{BenchScene, Rates, StepBench, StepReport, bench_step, measure_rates};
 use keysplat::geometry::{Pinhole, Se3, Trajectory};
 use keysplat::gpu::{AdapterSummary, Gpu, GpuError};
 use keysplat::optimise::TileSampling;

@@ -126,7 +126,7 @@ fn start_log(verbosity: Verbosity) -> miette::Result<()> {
     Ok(())
 }
 
-/// Prints figures on standard output, in the form that was asked for.
+/// Prints figures on standard output, in the requested form.
 fn print_metrics(metrics: &keysplat::evaluation::Metrics, verbosity: Verbosity) -> miette::Result<()> {
     if verbosity.json {
         print(&format!("{}\n", serde_json::to_string(metrics).into_diagnostic()?))

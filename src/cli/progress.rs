@@ -25,7 +25,7 @@ pub fn spinner(verbosity: Verbosity, template: &str) -> ProgressBar {
     ProgressBar::new_spinner().with_style(ProgressStyle::with_template(template).expect("our templates are valid"))
 }
 
-/// The first Ctrl-C asks the run to finish with what there is, the second ends the program.
+/// The first Ctrl-C ends the replay and writes the results so far, the second ends the program.
 pub fn stop_on_ctrl_c(stop: &Arc<AtomicBool>) -> miette::Result<()> {
     let stop = stop.clone();
     ctrlc::set_handler(move || {

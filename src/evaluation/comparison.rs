@@ -20,6 +20,7 @@ pub struct Comparison {
 /// Where a frame was taken.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PoseRecord {
+    /// Seconds, by the clock of the recording.
     pub timestamp_s: f64,
     /// Camera centre, metres.
     pub position: [f64; 3],

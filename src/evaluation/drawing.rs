@@ -13,6 +13,9 @@ const ESTIMATE: RGBColor = RGBColor(20, 90, 200);
 const ERROR: RGBColor = RGBColor(200, 60, 40);
 
 /// The path as seen along the axis in which it extends least, truth in grey, and below it the error in centimetres over time.
+///
+/// # Errors
+/// The text of the drawing library, if it cannot draw.
 pub fn draw_trajectory(truth: &Trajectory, estimate: &Trajectory, errors: &TrajectoryErrors) -> Result<String, String> {
     let aligned: Vec<[f64; 3]> = estimate
         .poses

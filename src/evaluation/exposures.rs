@@ -11,6 +11,7 @@ pub struct Exposures(Vec<ExposureRecord>);
 /// The camera's exposure at one moment.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ExposureRecord {
+    /// Seconds, by the clock of the recording.
     pub timestamp_s: f64,
     /// Of red, green and blue: natural logarithm of what the picture's colour is to the map's.
     pub log_gain: Exposure,
@@ -33,6 +34,7 @@ impl Exposures {
         records.iter().all(sane).then(|| Self::new(records))
     }
 
+    /// Whether there is no record.
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()
     }

@@ -21,17 +21,33 @@ const C2: f64 = 0.03 * 0.03;
 /// A colour image, row-major `[height * width]`, RGB in [0, 1].
 #[derive(Clone, Debug, PartialEq)]
 pub struct ImageF32 {
+    /// Pixels.
     pub width: usize,
+    /// Pixels.
     pub height: usize,
+    /// Row-major `[height * width]`, RGB in [0, 1].
     pub pixels: Vec<[f32; 3]>,
 }
 
+/// Images that cannot be compared.
 #[derive(Debug, PartialEq, thiserror::Error)]
 pub enum ImageError {
+    /// The images differ in size.
     #[error("images of {a:?} and {b:?} pixels cannot be compared; resize one")]
-    Size { a: (usize, usize), b: (usize, usize) },
+    Size {
+        /// Width and height of the first, pixels.
+        a: (usize, usize),
+        /// Width and height of the second, pixels.
+        b: (usize, usize),
+    },
+    /// An image smaller than the window of SSIM.
     #[error("an image of {width}x{height} is smaller than SSIM's window of {WINDOW}x{WINDOW}")]
-    TooSmall { width: usize, height: usize },
+    TooSmall {
+        /// Pixels.
+        width: usize,
+        /// Pixels.
+        height: usize,
+    },
 }
 
 impl ImageF32 {
@@ -62,12 +78,18 @@ impl ImageF32 {
 }
 
 /// Peak signal-to-noise ratio over all pixels and channels, dB, for a peak of 1; infinite for equal images.
+///
+/// # Errors
+/// [`ImageError::Size`] if the images differ in size.
 pub fn psnr(rendered: &ImageF32, recorded: &ImageF32) -> Result<f64, ImageError> {
     psnr_where(rendered, recorded, |_| true)
 }
 
 /// PSNR over the values where the recorded image is above zero, channel by channel: MonoGS's protocol, which hides the black
 /// borders of undistorted images. Infinite where there is none.
+///
+/// # Errors
+/// [`ImageError::Size`] if the images differ in size.
 pub fn psnr_where_lit(rendered: &ImageF32, recorded: &ImageF32) -> Result<f64, ImageError> {
     psnr_where(rendered, recorded, |value| value > 0.0)
 }
@@ -85,6 +107,9 @@ fn psnr_where(rendered: &ImageF32, recorded: &ImageF32, counts: impl Fn(f32) -> 
 }
 
 /// Structural similarity, the mean over RGB and over the pixels whose whole window is inside the image.
+///
+/// # Errors
+/// [`ImageError::Size`] if the images differ in size, [`ImageError::TooSmall`] if they are smaller than the window.
 pub fn ssim(a: &ImageF32, b: &ImageF32) -> Result<f64, ImageError> {
     a.check_same_size(b)?;
     let (width, height) = (a.width, a.height);

@@ -1,4 +1,4 @@
-//! What the run's machine was and how much memory the run took, as far as the system tells. Linux only; elsewhere `None`.
+//! Processor name and peak memory, as the system reports them. Linux only; elsewhere `None`.
 
 /// The largest resident memory this process has had, bytes (`VmHWM`).
 pub fn peak_host_bytes() -> Option<u64> {

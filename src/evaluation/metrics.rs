@@ -16,23 +16,35 @@ use crate::files::{WriteError, write_atomically};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Metrics {
+    /// Name of the recording.
     pub sequence: String,
+    /// Sensor of the run, which may be less than the recording's.
     pub sensor: SensorKind,
     /// Frames arrived by their timestamps (`true`) or as fast as they were consumed.
     pub paced: bool,
+    /// Frames replayed.
     pub frames: u64,
+    /// Frames whose images could not be read.
     pub frames_read_failed: u64,
+    /// Frames with a pose.
     pub frames_tracked: u64,
-    /// Paced replay: frames that came while the tracker was busy, and keyframes that the mapper never got.
+    /// Real-time replay: frames dropped while the tracker was busy.
     #[serde(default)]
     pub frames_late: u64,
+    /// Real-time replay: keyframes that a newer one replaced before the mapper took them.
     #[serde(default)]
     pub keyframes_deferred: u64,
+    /// Keyframes created; `None` with known poses.
     pub keyframes: Option<u64>,
+    /// Absolute trajectory error, RMSE, metres.
     pub ate_rmse_m: AteFigures,
+    /// Relative pose error.
     pub rpe: RpeFigures,
+    /// Image quality by protocol.
     pub images: ImageProtocols,
+    /// Gaussians in the exported map.
     pub gaussians: Option<u64>,
+    /// Size of the exported map, bytes.
     pub map_bytes: Option<u64>,
     /// SHA-256 of the exported map's bytes.
     pub map_hash: Option<String>,
@@ -41,13 +53,21 @@ pub struct Metrics {
     /// How often it was interrupted and went on from a checkpoint; parts that came to no checkpoint of their own do not count.
     #[serde(default)]
     pub resumed: u64,
+    /// Tracking time of a frame, milliseconds.
     pub tracking_ms: Option<Times>,
+    /// Figures of the optimisation.
     pub mapping: Option<MappingFigures>,
+    /// Peak resident memory of the process, bytes.
     pub peak_host_bytes: Option<u64>,
+    /// Peak of the buffers allocated on the adapter, bytes.
     pub peak_gpu_bytes: Option<u64>,
+    /// The GPU adapter.
     pub adapter: Option<Adapter>,
+    /// Model name of the processor.
     pub cpu: Option<String>,
+    /// Hardware threads.
     pub threads: u64,
+    /// Version of keysplat.
     pub version: String,
     /// SHA-256 of the resolved configuration's text.
     pub config_hash: Option<String>,
@@ -57,7 +77,9 @@ pub struct Metrics {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct AteFigures {
+    /// Over all frames with a pose, metres.
     pub all_frames: Option<f64>,
+    /// Over keyframes alone, metres.
     pub keyframes: Option<f64>,
 }
 
@@ -65,7 +87,9 @@ pub struct AteFigures {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RpeFigures {
+    /// Translation, metres a frame.
     pub trans_m_per_frame: Option<f64>,
+    /// Rotation, degrees a frame.
     pub rot_deg_per_frame: Option<f64>,
 }
 
@@ -88,8 +112,11 @@ pub struct ImageProtocols {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ImageFigures {
+    /// Images compared.
     pub count: u64,
+    /// Mean PSNR, dB.
     pub psnr_db: Option<f64>,
+    /// Mean SSIM.
     pub ssim: Option<f64>,
     /// Over the images that have sensor depth.
     pub depth_l1_m: Option<f64>,
@@ -109,8 +136,11 @@ pub struct ImageMeans {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Times {
+    /// Median.
     pub median: f64,
+    /// 95th percentile.
     pub p95: f64,
+    /// Maximum.
     pub max: f64,
 }
 
@@ -118,18 +148,25 @@ pub struct Times {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct UsualTimes {
+    /// Median.
     pub median: f64,
+    /// 95th percentile.
     pub p95: f64,
 }
 
+/// Steps and times of the optimisation.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct MappingFigures {
+    /// Optimisation steps.
     pub iterations: u64,
+    /// Steps divided by replayed frames.
     pub iterations_per_frame: f64,
+    /// Time of a step, milliseconds.
     pub ms_per_iteration: Option<UsualTimes>,
     /// The size at which the mapper compares images, pixels.
     pub map_width: u32,
+    /// Height of these images, pixels.
     pub map_height: u32,
 }
 
@@ -137,10 +174,13 @@ pub struct MappingFigures {
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Adapter {
+    /// Name that the driver reports.
     pub name: String,
+    /// Graphics interface, such as `vulkan`.
     pub backend: String,
     /// `discretegpu`, `integratedgpu`, `virtualgpu`, `cpu` or `other`.
     pub kind: String,
+    /// Driver and its version.
     pub driver: String,
 }
 
@@ -196,6 +236,9 @@ pub fn sha256_hex(bytes: &[u8]) -> String {
 }
 
 /// Writes `metrics.json`.
+///
+/// # Errors
+/// [`WriteError`] if the file cannot be written.
 pub fn write_json(metrics: &Metrics, path: &Path) -> Result<(), WriteError> {
     let mut text = serde_json::to_string_pretty(metrics).expect("metrics are numbers and strings, which JSON can hold");
     text.push('\n');
@@ -276,7 +319,7 @@ impl fmt::Display for Adapter {
 mod tests {
     use super::*;
 
-    /// The example of the protocol, field for field, and what it leaves out: counts of paced and resumed replays, the map's own colours.
+    /// The example of the protocol, field for field, and what it leaves out: counts of real-time and resumed replays, the map's own colours.
     const EXAMPLE: &str = r#"{ "sequence": "redkitchen", "sensor": "rgbd", "paced": false, "frames": 600, "frames_read_failed": 0,
       "frames_tracked": 600, "frames_late": 0, "keyframes_deferred": 0, "keyframes": 61,
       "ate_rmse_m": {"all_frames": 0.01, "keyframes": 0.01}, "rpe": {"trans_m_per_frame": 0.002, "rot_deg_per_frame": 0.1},

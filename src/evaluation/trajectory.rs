@@ -25,12 +25,20 @@ pub enum Alignment {
     Similarity,
 }
 
+/// Trajectories that cannot be aligned.
 #[derive(Debug, PartialEq, thiserror::Error)]
 pub enum AlignmentError {
+    /// Too few poses have a true pose at their time.
     #[error(
         "only {pairs} poses lie within {max_difference_s} s of the truth's; at least {MIN_PAIRS} are needed: check that both count time from the same start"
     )]
-    TooFewPairs { pairs: usize, max_difference_s: f64 },
+    TooFewPairs {
+        /// Poses with a true pose.
+        pairs: usize,
+        /// Largest difference of associated timestamps, seconds.
+        max_difference_s: f64,
+    },
+    /// The camera did not move, which leaves the scale undefined.
     #[error("the camera stands still, so no scale can be found; align rigidly")]
     NoScale,
 }
@@ -38,7 +46,9 @@ pub enum AlignmentError {
 /// Positions (in `poses`) of two poses of the same moment.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Pair {
+    /// Index of the true pose.
     pub truth: usize,
+    /// Index of the estimated pose.
     pub estimate: usize,
 }
 
@@ -49,8 +59,11 @@ pub struct TrajectoryErrors {
     pub pairs: usize,
     /// Absolute translation error after alignment, metres.
     pub ate_rmse_m: f64,
+    /// Median of the absolute translation error, metres.
     pub ate_median_m: f64,
+    /// Maximum of the absolute translation error, metres.
     pub ate_max_m: f64,
+    /// Relative pose errors.
     pub rpe: RelativeErrors,
     /// `truth_from_estimate`, between the two worlds.
     pub alignment: Sim3,
@@ -65,12 +78,19 @@ pub struct TrajectoryErrors {
 /// median over the estimate. Two poses that share one true pose make no step here, though one of no true motion in evo.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RelativeErrors {
+    /// Pairs of consecutive associated poses.
     pub steps: usize,
+    /// Translation, metres a step.
     pub trans_m_per_step: f64,
+    /// Rotation, degrees a step.
     pub rot_deg_per_step: f64,
+    /// Translation, metres a frame.
     pub trans_m_per_frame: f64,
+    /// Rotation, degrees a frame.
     pub rot_deg_per_frame: f64,
+    /// Translation, metres a second.
     pub trans_m_per_s: f64,
+    /// Rotation, degrees a second.
     pub rot_deg_per_s: f64,
 }
 
@@ -93,6 +113,9 @@ pub fn associate(truth: &Trajectory, estimate: &Trajectory, max_difference_s: f6
 /// Aligns an estimate with the truth and measures it; stamps are associated within [`MAX_TIME_DIFFERENCE_S`].
 ///
 /// For the error over keyframes give a trajectory of keyframes only: the alignment is then theirs too, as in MonoGS.
+///
+/// # Errors
+/// [`AlignmentError::TooFewPairs`] below three associated poses, [`AlignmentError::NoScale`] if the scale is free and the camera stands still.
 pub fn evaluate_trajectory(
     truth: &Trajectory,
     estimate: &Trajectory,

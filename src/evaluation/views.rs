@@ -30,6 +30,7 @@ pub struct ViewSelection<'a> {
     pub poses: &'a [(usize, Se3)],
     /// Frame indices of keyframes.
     pub keyframes: &'a BTreeSet<usize>,
+    /// Whether a frame index was withheld from the mapper.
     pub is_held_out: &'a (dyn Fn(usize) -> bool + Sync),
     /// The camera's over time, by the keyframes alone: renders of held-out views get them before they are compared.
     pub exposures: &'a Exposures,
@@ -37,8 +38,11 @@ pub struct ViewSelection<'a> {
 
 /// One held-out view beside what was recorded.
 pub struct ComparedView {
+    /// Quality of the rendered view.
     pub figures: ViewRecord,
+    /// The recorded image, rectified.
     pub recorded: RgbImage,
+    /// The rendered image, with exposure applied.
     pub rendered: RgbImage,
 }
 
@@ -49,6 +53,7 @@ pub struct ViewRecord {
     pub frame: usize,
     /// `null` where both images are equal.
     pub psnr_db: Option<f64>,
+    /// SSIM over all pixels.
     pub ssim: f64,
     /// Where the sensor has depth.
     pub depth_l1_m: Option<f64>,

@@ -152,20 +152,59 @@ impl<'de> Deserialize<'de> for MapFormat {
 /// A map that cannot be written or read.
 #[derive(Debug, thiserror::Error)]
 pub enum ExportError {
+    /// The file cannot be written.
     #[error(transparent)]
     Write(#[from] WriteError),
+    /// The file cannot be read.
     #[error("cannot read {path}: {source}")]
-    Read { path: PathBuf, source: std::io::Error },
+    Read {
+        /// The file or folder.
+        path: PathBuf,
+        /// The cause.
+        source: std::io::Error,
+    },
+    /// A Gaussian has a value that is not finite.
     #[error("Gaussian {index} of the map is not finite, so the map was not exported; please report this with the run's log")]
-    NonFinite { index: usize },
+    NonFinite {
+        /// Index in the map.
+        index: usize,
+    },
+    /// The file's header is not that of the format.
     #[error("{path}:{line}: {what}; expected the header of a binary little-endian 3DGS PLY")]
-    Header { path: PathBuf, line: usize, what: String },
+    Header {
+        /// The file or folder.
+        path: PathBuf,
+        /// Line in the file, from 1.
+        line: usize,
+        /// What is wrong.
+        what: String,
+    },
+    /// The file is shorter or longer than its header states.
     #[error(
         "{path}: the header promises {vertices} Gaussians of {stride} bytes, but {found} bytes follow it; the file is cut off or damaged: copy or export it anew"
     )]
-    Length { path: PathBuf, vertices: u64, stride: usize, found: u64 },
+    Length {
+        /// The file or folder.
+        path: PathBuf,
+        /// Gaussians in the header.
+        vertices: u64,
+        /// Bytes of a Gaussian.
+        stride: usize,
+        /// Bytes after the header.
+        found: u64,
+    },
+    /// A value in the file is not finite.
     #[error("{path}: `{property}` of Gaussian {index} is {value}; the map is damaged: export it anew")]
-    Value { path: PathBuf, index: usize, property: String, value: f32 },
+    Value {
+        /// The file or folder.
+        path: PathBuf,
+        /// Index in the map.
+        index: usize,
+        /// Name of the property.
+        property: String,
+        /// The value found.
+        value: f32,
+    },
 }
 
 #[cfg(test)]

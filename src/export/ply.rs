@@ -204,7 +204,7 @@ fn parse_header(lines: &[String], path: &Path) -> Result<VertexLayout, ExportErr
     Ok(VertexLayout { vertices, stride, sh_degree, offsets, more_elements })
 }
 
-/// Finds what a Gaussian needs among `(name, type, offset)`; the number of `f_rest` properties tells the degree.
+/// Finds a Gaussian's properties among `(name, type, offset)`; the number of `f_rest` properties gives the degree.
 fn gaussian_offsets(properties: &[(String, &str, usize)]) -> Result<(ShDegree, Vec<(String, usize)>), String> {
     let rest = properties.iter().filter(|(name, ..)| name.starts_with("f_rest_")).count();
     let sh_degree = ShDegree::ALL.into_iter().find(|degree| 3 * (degree.coefficients() - 1) == rest);

@@ -6,7 +6,7 @@ use nalgebra::{Matrix3, Matrix4, Quaternion, UnitQuaternion, Vector3};
 use super::Sim3;
 
 /// The motion that brings `from` closest to `to` in the least-squares sense, `[N, 3]`, point `i` to point `i`; its scale is 1 unless
-/// `scale_is_free`. `None` without points, or where a scale is asked of points that are all in one place.
+/// `scale_is_free`. `None` without points, or if the scale is free and all points coincide.
 ///
 /// Points on one line leave the rotation about it open; the smallest distance is the same for each choice.
 pub fn align(from: &[Vector3<f64>], to: &[Vector3<f64>], scale_is_free: bool) -> Option<Sim3> {

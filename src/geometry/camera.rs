@@ -9,11 +9,17 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Pinhole {
+    /// Focal length along x.
     pub fx: f64,
+    /// Focal length along y.
     pub fy: f64,
+    /// Principal point, x; the centre of the first pixel is 0.
     pub cx: f64,
+    /// Principal point, y.
     pub cy: f64,
+    /// Image width.
     pub width: u32,
+    /// Image height.
     pub height: u32,
 }
 
@@ -58,14 +64,20 @@ impl Pinhole {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Distortion {
+    /// Radial, second order.
     pub k1: f64,
+    /// Radial, fourth order.
     pub k2: f64,
+    /// Tangential, along y.
     pub p1: f64,
+    /// Tangential, along x.
     pub p2: f64,
+    /// Radial, sixth order.
     pub k3: f64,
 }
 
 impl Distortion {
+    /// Whether the lens has no distortion.
     pub fn is_zero(&self) -> bool {
         *self == Self::default()
     }
@@ -101,7 +113,9 @@ impl Distortion {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Camera {
+    /// Projection without the lens.
     pub pinhole: Pinhole,
+    /// Distortion of the lens; zero by default.
     #[serde(default)]
     pub distortion: Distortion,
     /// Depth image value of one metre (5000 in TUM's recordings).

@@ -11,6 +11,7 @@ use super::se3::{Se3, skew};
 
 /// `(ρ, θ, λ)`.
 pub type Vector7 = SVector<f64, 7>;
+/// A matrix over tangent vectors `(ρ, θ, λ)`.
 pub type Matrix7 = SMatrix<f64, 7, 7>;
 
 /// Terms after which the series of `e^z` is exact to f64 for every rotation and all scales from 1/20 to 20.
@@ -19,6 +20,7 @@ const SERIES_TERMS: usize = 40;
 /// A similarity; its action is `p_in_a = scale * rotation * p_in_b + translation`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Sim3 {
+    /// a_from_b, unit length.
     pub rotation: UnitQuaternion<f64>,
     /// In units of a.
     pub translation: Vector3<f64>,
@@ -27,15 +29,18 @@ pub struct Sim3 {
 }
 
 impl Sim3 {
+    /// No rotation, no translation, scale 1.
     pub fn identity() -> Self {
         Self::from(Se3::identity())
     }
 
+    /// b_from_a.
     pub fn inverse(&self) -> Self {
         let rotation = self.rotation.inverse();
         Self { rotation, translation: rotation * self.translation / -self.scale, scale: 1.0 / self.scale }
     }
 
+    /// Transforms a point of b's frame to a's.
     pub fn act(&self, p_in_b: &Point3<f64>) -> Point3<f64> {
         Point3::from(self.rotation * p_in_b.coords * self.scale + self.translation)
     }

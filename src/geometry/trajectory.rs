@@ -7,40 +7,79 @@ use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
 
 use super::Se3;
 
+/// A camera pose with its time.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct StampedPose {
+    /// Seconds, by the clock of the recording.
     pub timestamp_s: f64,
+    /// Camera pose in the world, metres.
     pub world_from_camera: Se3,
 }
 
 /// Poses in the order of their timestamps.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Trajectory {
+    /// Poses, strictly ascending in time.
     pub poses: Vec<StampedPose>,
 }
 
+/// A trajectory file that cannot be read or written.
 #[derive(Debug, thiserror::Error)]
 pub enum TrajectoryError {
+    /// The file cannot be read.
     #[error("cannot read {path}: {source}")]
-    Read { path: PathBuf, source: std::io::Error },
+    Read {
+        /// The file or folder.
+        path: PathBuf,
+        /// The cause.
+        source: std::io::Error,
+    },
+    /// The file cannot be written.
     #[error("cannot write {path}: {source}")]
-    Write { path: PathBuf, source: std::io::Error },
+    Write {
+        /// The file or folder.
+        path: PathBuf,
+        /// The cause.
+        source: std::io::Error,
+    },
+    /// A line is not eight finite numbers.
     #[error("{path}:{line}: {what}; expected `timestamp tx ty tz qx qy qz qw` in finite numbers")]
-    Syntax { path: PathBuf, line: usize, what: String },
+    Syntax {
+        /// The file or folder.
+        path: PathBuf,
+        /// Line in the file, from 1.
+        line: usize,
+        /// What is wrong.
+        what: String,
+    },
+    /// Timestamps do not ascend.
     #[error(
         "{path}:{line}: the timestamp {timestamp_s} is not after the one before it; sort the file by time and drop duplicates"
     )]
-    Unsorted { path: PathBuf, line: usize, timestamp_s: f64 },
+    Unsorted {
+        /// The file or folder.
+        path: PathBuf,
+        /// Line in the file, from 1.
+        line: usize,
+        /// Seconds, by the clock of the recording.
+        timestamp_s: f64,
+    },
 }
 
 impl Trajectory {
     /// Reads a TUM trajectory file.
+    ///
+    /// # Errors
+    /// [`TrajectoryError`] if the file cannot be read, a line is no pose, or timestamps do not ascend.
     pub fn read_tum(path: &Path) -> Result<Self, TrajectoryError> {
         let text = std::fs::read_to_string(path).map_err(|source| TrajectoryError::Read { path: path.into(), source })?;
         Self::parse_tum(&text, path)
     }
 
     /// Parses a TUM trajectory; `path` is named in errors.
+    ///
+    /// # Errors
+    /// [`TrajectoryError::Syntax`] or [`TrajectoryError::Unsorted`] with the line.
     pub fn parse_tum(text: &str, path: &Path) -> Result<Self, TrajectoryError> {
         let mut poses: Vec<StampedPose> = Vec::new();
         for (index, raw) in text.lines().enumerate() {
@@ -102,6 +141,9 @@ impl Trajectory {
     }
 
     /// Writes the TUM text to `path`.
+    ///
+    /// # Errors
+    /// [`TrajectoryError::Write`] if the file cannot be written.
     pub fn write_tum(&self, path: &Path) -> Result<(), TrajectoryError> {
         let write_error = |source| TrajectoryError::Write { path: path.into(), source };
         let mut file = std::fs::File::create(path).map_err(write_error)?;

@@ -11,27 +11,59 @@ use super::profile::Profiler;
 /// Failure of the adapter, the device or an allocation on it.
 #[derive(Debug, thiserror::Error)]
 pub enum GpuError {
+    /// The system has no adapter.
     #[error(
         "no GPU adapter was found; install a Vulkan driver, or Mesa's software one (`apt-get install mesa-vulkan-drivers libvulkan1`), and see what there is with `keysplat adapters`"
     )]
     NoAdapter,
+    /// No adapter matches the wanted name.
     #[error("no adapter's name contains `{wanted}`; there are: {found}")]
-    NoSuchAdapter { wanted: String, found: String },
+    NoSuchAdapter {
+        /// Part of a name.
+        wanted: String,
+        /// Names of the adapters there are.
+        found: String,
+    },
+    /// The driver refuses a device.
     #[error("the adapter {adapter} gives no device: {source}")]
-    Device { adapter: String, source: wgpu::RequestDeviceError },
+    Device {
+        /// Name of the adapter.
+        adapter: String,
+        /// The cause.
+        source: wgpu::RequestDeviceError,
+    },
+    /// A device limit is too low.
     #[error(
         "the device's limit `{limit}` is {offered}, but keysplat needs {needed}; request `Gpu::required_limits` of the adapter"
     )]
-    MissingLimit { limit: &'static str, needed: u64, offered: u64 },
+    MissingLimit {
+        /// Name of the limit.
+        limit: &'static str,
+        /// Value needed.
+        needed: u64,
+        /// Value offered.
+        offered: u64,
+    },
+    /// The adapter lacks a feature.
     #[error("the adapter lacks {0}, which keysplat needs")]
     MissingCapability(String),
+    /// A buffer exceeds the adapter's binding size.
     #[error(
         "{label}: a buffer of {} MiB is needed, but the adapter binds at most {} MiB; lower the mapping resolution (--map-scale) or the number of Gaussians",
         needed.div_ceil(1 << 20), limit >> 20
     )]
-    TooLarge { label: String, needed: u64, limit: u64 },
+    TooLarge {
+        /// Name of the buffer.
+        label: String,
+        /// Bytes needed.
+        needed: u64,
+        /// Bytes that the adapter binds at most.
+        limit: u64,
+    },
+    /// An allocation failed on the adapter.
     #[error("the GPU ran out of memory ({0}); lower the mapping resolution (--map-scale) or the number of Gaussians")]
     OutOfMemory(String),
+    /// The device was lost, or a command failed.
     #[error("the GPU device failed: {0}")]
     Failed(String),
 }

@@ -45,6 +45,7 @@ pub fn workgroups(count: u32) -> [u32; 3] {
 /// A number of workgroups along x, y and z, three u32 in a buffer.
 #[derive(Clone, Copy)]
 pub struct IndirectSize<'a> {
+    /// The buffer.
     pub buffer: &'a GpuBuffer,
     /// Bytes from the buffer's start.
     pub offset: u64,

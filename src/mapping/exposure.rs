@@ -1,6 +1,6 @@
 //! A keyframe's exposure against the map's, which began as that of the first keyframe, and the image as it would be in the map's.
 //!
-//! It is measured once, when the keyframe comes, on the render that insertion asks for anyway: the median ratio of image and render over the
+//! It is measured once, when the keyframe comes, on the render that insertion needs as well: the median ratio of image and render over the
 //! pixels that both show well, in each channel. The map then learns from corrected images, and loss, insertion and scores know nothing of it.
 
 use image::{Rgb, RgbImage};

@@ -40,10 +40,14 @@ impl Keyframe {
 /// Where a keyframe's depth comes from.
 #[derive(Clone, Debug, Default)]
 pub enum DepthSource {
+    /// Measured by a depth sensor.
     #[default]
     Sensor,
     /// It is that of landmarks: sparse.
-    Landmarks { right: Option<RightImage> },
+    Landmarks {
+        /// The right image of a stereo pair.
+        right: Option<RightImage>,
+    },
 }
 
 /// The other image of a stereo pair, at the mapping resolution.

@@ -40,14 +40,25 @@ const YIELDING_BATCH: usize = 3;
 /// Failure of the mapper.
 #[derive(Debug, thiserror::Error)]
 pub enum MappingError {
+    /// Failure of the adapter.
     #[error(transparent)]
     Gpu(#[from] GpuError),
+    /// No keyframe has depth to start from.
     #[error("none of the keyframes has depth, neither measured nor of landmarks, and a map can only begin with depth")]
     NoDepth,
+    /// The loss of a keyframe is not finite.
     #[error("the loss of keyframe {id} is not finite; please report this with the recording's name and the configuration")]
-    NotFinite { id: KeyframeId },
+    NotFinite {
+        /// The keyframe.
+        id: KeyframeId,
+    },
+    /// A replayed keyframe differs from the checkpoint's.
     #[error("keyframe {id} comes in another place or another size than before")]
-    NotTheSame { id: KeyframeId },
+    NotTheSame {
+        /// The keyframe.
+        id: KeyframeId,
+    },
+    /// The checkpoint's parts contradict each other.
     #[error("the mapper's state contradicts itself")]
     State,
 }
@@ -106,7 +117,7 @@ impl Mapper {
         })
     }
 
-    /// Takes in a keyframe: inserts what the map lacks, optimises over the window, prunes. `stop` is asked between the steps. A keyframe without
+    /// Takes in a keyframe: inserts what the map lacks, optimises over the window, prunes. `stop` is polled between the steps. A keyframe without
     /// depth is passed over until there is a map.
     ///
     /// # Errors

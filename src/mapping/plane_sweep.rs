@@ -1,7 +1,7 @@
 //! Depth of a keyframe whose camera measures none: a plane sweep over inverse depth (Collins, *A Space-Sweep Approach*, CVPR 1996) against
 //! other views at known poses, census costs (Zabih & Woodfill 1994), semi-global aggregation (Hirschmüller, PAMI 2008).
 //!
-//! Landmarks say where to search and whether to believe what was found. A pixel whose best depth is not clearly the best, or that its
+//! Landmarks bound the search and validate its result. A pixel whose best depth is not clearly the best, or that its
 //! neighbours contradict, has none. Left out: slanted planes, and refinement of the poses.
 
 mod aggregate;
@@ -28,7 +28,7 @@ pub struct PlaneSweepConfig {
     pub min_parallax_pixels: f64,
     /// The second best depth must cost this many times as much as the best one.
     pub uniqueness: f32,
-    /// Share of the landmarks that must be met, for anything to be believed.
+    /// Least share of landmarks that the depth must agree with; below it all depth is dropped.
     pub min_agreement: f64,
     /// What such depth, and that of landmarks alone, counts in the loss: as a share of measured depth (`mapping.loss.depth_weight`).
     pub depth_confidence: f32,
@@ -87,7 +87,7 @@ pub(super) fn gray(color: &RgbImage) -> GrayImage {
     imageops::grayscale(color)
 }
 
-/// Depth of a view from `landmarks` (its sparse depth) and the other views in order of preference; `None` where they don't tell.
+/// Depth of a view from `landmarks` (its sparse depth) and the other views in order of preference; `None` where the views do not determine it.
 pub(super) fn estimate(
     view: &SourceView<'_>,
     landmarks: &DepthImage,

@@ -28,7 +28,7 @@ const MIN_STEPS: i32 = 8;
 pub struct RefinePosesConfig {
     /// Whether poses are refined at all.
     pub enabled: bool,
-    /// Whether the tracker is told the refined poses, as measurements of relative poses.
+    /// Whether refined poses are sent to the tracker, as relative pose measurements.
     pub tell_tracker: bool,
     /// Most that a step turns or shifts a keyframe: radians, metres.
     pub lr_rotation: f64,

@@ -7,7 +7,7 @@ use fastrand::Rng;
 use super::keyframe::MappedKeyframe;
 use super::{ScheduleConfig, WindowConfig};
 
-/// So many steps are judged together,
+/// So many steps are classified together,
 const JUDGED: usize = 10;
 /// and so many of them must be of views seen before in the same session, or their gain says nothing.
 const MIN_REPEATED: usize = 4;

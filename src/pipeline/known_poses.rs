@@ -1,6 +1,6 @@
 //! Replaces tracking where the recording provides poses.
 //!
-//! Photos become keyframes all, frames of a moving camera where it has moved as far as the tracker would ask for; held-out ones never.
+//! Photos become keyframes all, frames of a moving camera by the tracker's keyframe thresholds; held-out ones never.
 //! Frames without a pose count as lost. Where the recording has no depth, its points begin the map, and the world's unit is theirs.
 
 use std::collections::HashSet;

@@ -30,7 +30,7 @@ pub(super) struct PoseFeedbackSender(Option<Sender<PoseFeedback>>);
 #[derive(Debug, Default)]
 pub(super) struct PoseFeedbackReceiver {
     reports: Option<Receiver<PoseFeedback>>,
-    paced: bool,
+    real_time: bool,
     /// Keyframes sent whose feedback has not arrived.
     awaited: VecDeque<KeyframeId>,
 }
@@ -44,7 +44,7 @@ pub(super) fn channel(config: &Config) -> (PoseFeedbackSender, PoseFeedbackRecei
     let (sender, reports) = bounded(LAG + 1);
     (
         PoseFeedbackSender(Some(sender)),
-        PoseFeedbackReceiver { reports: Some(reports), paced: config.replay.real_time, awaited: VecDeque::new() },
+        PoseFeedbackReceiver { reports: Some(reports), real_time: config.replay.real_time, awaited: VecDeque::new() },
     )
 }
 
@@ -61,7 +61,7 @@ impl PoseFeedbackReceiver {
     /// Feedback to apply after a frame that sent `keyframe` to the mapper.
     pub fn receive(&mut self, keyframe: Option<KeyframeId>) -> Vec<PoseMeasurement> {
         let Some(reports) = &self.reports else { return Vec::new() };
-        if self.paced {
+        if self.real_time {
             return reports.try_iter().flat_map(|report| report.measurements).collect();
         }
         self.awaited.extend(keyframe);
@@ -100,10 +100,10 @@ mod tests {
     /// Longer means a deadlock.
     const HANGS_AFTER: Duration = Duration::from_secs(60);
 
-    fn config(paced: bool) -> Config {
+    fn config(real_time: bool) -> Config {
         let mut config = Config::default();
         config.mapping.refine_poses.enabled = true;
-        config.replay.real_time = paced;
+        config.replay.real_time = real_time;
         config
     }
 
@@ -113,11 +113,11 @@ mod tests {
     }
 
     /// A tracker that sends keyframes until `tracked` and a mapper that maps those before `mapped`; the feedback after each.
-    fn converse(paced: bool, tracked: usize, mapped: usize) -> Vec<Vec<KeyframeId>> {
+    fn converse(real_time: bool, tracked: usize, mapped: usize) -> Vec<Vec<KeyframeId>> {
         let (done, result) = bounded(1);
         std::thread::spawn(move || {
             let (to_mapper, keyframes) = bounded::<KeyframeId>(4);
-            let (sender, mut receiver) = channel(&config(paced));
+            let (sender, mut receiver) = channel(&config(real_time));
             let mapper = std::thread::spawn(move || {
                 for keyframe in keyframes.iter().take(mapped) {
                     sender.send(keyframe, &[pair(keyframe)]);
@@ -127,7 +127,7 @@ mod tests {
             for keyframe in 0..tracked {
                 let _ = to_mapper.send(keyframe);
                 received.push(receiver.receive(Some(keyframe)).iter().map(|m| m.keyframe).collect());
-                assert!(paced || receiver.receive(None).is_empty());
+                assert!(real_time || receiver.receive(None).is_empty());
             }
             drop((to_mapper, receiver));
             mapper.join().unwrap();

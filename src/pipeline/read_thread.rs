@@ -17,7 +17,7 @@ pub(super) struct ReadSummary {
 }
 
 /// Sends every readable frame, in order. Real-time replay waits for each frame's timestamp and never blocks on the tracker.
-pub(super) fn read(sequence: &Sequence, paced: bool, sender: &Sender<Frame>, progress: &Progress) -> ReadSummary {
+pub(super) fn read(sequence: &Sequence, real_time: bool, sender: &Sender<Frame>, progress: &Progress) -> ReadSummary {
     let mut summary = ReadSummary::default();
     let started = Instant::now();
     let first_s = sequence.entries.first().map_or(0.0, |entry| entry.timestamp_s);
@@ -34,7 +34,7 @@ pub(super) fn read(sequence: &Sequence, paced: bool, sender: &Sender<Frame>, pro
                 continue;
             }
         };
-        if paced {
+        if real_time {
             let due = Duration::try_from_secs_f64(frame.timestamp_s - first_s).unwrap_or_default();
             std::thread::sleep(due.saturating_sub(started.elapsed()));
             match sender.try_send(frame) {

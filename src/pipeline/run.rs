@@ -46,9 +46,9 @@ pub fn run(
     let started = Instant::now();
     let mut elapsed = checkpointer.as_ref().map_or_else(Elapsed::default, Checkpointer::earlier);
     let config = recording.config();
-    let paced = config.replay.real_time;
+    let real_time = config.replay.real_time;
     let (frame_sender, frames) = bounded(FRAMES_AHEAD);
-    let waiting = paced.then(|| frames.clone());
+    let waiting = real_time.then(|| frames.clone());
     let (message_sender, messages) = bounded(MESSAGES_AHEAD);
     let (feedback_sender, feedback) = pose_feedback::channel(config);
     let mapping = &known_poses::mapping_config(recording);
@@ -72,7 +72,7 @@ pub fn run(
             .map_err(spawn_error("tracking"))?;
         let read = Builder::new()
             .name("reading".into())
-            .spawn_scoped(scope, move || read_thread::read(recording.sequence(), paced, &frame_sender, progress))
+            .spawn_scoped(scope, move || read_thread::read(recording.sequence(), real_time, &frame_sender, progress))
             .map_err(spawn_error("reading"))?;
         Ok::<_, PipelineError>((join("reading", read), join("tracking", track), join("mapping", map)))
     })?;

@@ -27,20 +27,20 @@ pub(super) struct TrackSummary {
 /// The channel to the mapper, with its overflow policy.
 pub(super) struct KeyframeSender<'a> {
     sender: &'a Sender<MapperMessage>,
-    paced: bool,
+    real_time: bool,
     /// Real time: the newest keyframe that found the channel full.
     waiting: Option<MapperMessage>,
     deferred: usize,
 }
 
 impl<'a> KeyframeSender<'a> {
-    pub fn new(sender: &'a Sender<MapperMessage>, paced: bool) -> Self {
-        Self { sender, paced, waiting: None, deferred: 0 }
+    pub fn new(sender: &'a Sender<MapperMessage>, real_time: bool) -> Self {
+        Self { sender, real_time, waiting: None, deferred: 0 }
     }
 
     /// Sends a message; `false` if the mapper has closed the channel.
     pub fn send(&mut self, message: MapperMessage) -> bool {
-        if !self.paced {
+        if !self.real_time {
             return self.sender.send(message).is_ok();
         }
         let is_keyframe = matches!(message, MapperMessage::Keyframe(_));
@@ -88,7 +88,7 @@ impl TrackThread<'_> {
         let (sequence, config) = (self.recording.sequence(), self.recording.config());
         let mut summary = TrackSummary::default();
         let mut tracker = match Tracker::new(sequence.camera, sequence.sensor, &config.tracking) {
-            Ok(tracker) => tracker.paced(config.replay.real_time),
+            Ok(tracker) => tracker.real_time(config.replay.real_time),
             Err(error) => return TrackSummary { error: Some(error.into()), ..summary },
         };
         let rectifier = Rectifier::new(&sequence.camera, config.map_scale);

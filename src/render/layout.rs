@@ -182,87 +182,151 @@ macro_rules! host_twins {
 host_twins! {
     /// One camera view of the map (`shaders/shared/view.wgsl`).
     View {
+        /// First row of camera_from_world, rotation and translation.
         camera_row_0: [f32; 4],
+        /// Second row.
         camera_row_1: [f32; 4],
+        /// Third row.
         camera_row_2: [f32; 4],
+        /// Camera centre, metres; the last lane is unused.
         center_in_world: [f32; 4],
+        /// fx, fy, cx, cy, pixels.
         intrinsics: [f32; 4],
+        /// Bounds of x/z and y/z within which the projection is linearised: least x, most x, least y, most y.
         tangent_bounds: [f32; 4],
+        /// RGB behind the map; the last lane is unused.
         background: [f32; 4],
+        /// Image width, pixels.
         width: u32,
+        /// Image height, pixels.
         height: u32,
+        /// Tiles in a row.
         tiles_x: u32,
+        /// Rows of tiles.
         tiles_y: u32,
+        /// Gaussians in the map.
         gaussian_count: u32,
+        /// Gaussians that the planes have space for.
         capacity: u32,
+        /// Degree of the spherical harmonics, 0 to 3.
         sh_degree: u32,
+        /// Tile intersections that the buffers have space for.
         intersection_capacity: u32,
     }
     /// Counts made on the GPU, and the indirect dispatches that follow from them (`shaders/shared/counters.wgsl`).
     #[derive(Default)]
     Counter {
+        /// Elements, at most the capacity.
         count: u32,
+        /// Elements that there would be with enough capacity.
         needed: u32,
+        /// Workgroups for one lane an element.
         per_element: [u32; 3],
+        /// Workgroups for one sorting block a workgroup.
         per_block: [u32; 3],
     }
+    /// Input and output of a prefix sum (`shaders/scan.wgsl`).
     ScanSetup {
+        /// Values, where no counter holds their number.
         count: u32,
+        /// Counter that holds their number.
         counter_in: u32,
+        /// Counter that receives the total.
         counter_out: u32,
+        /// Upper bound of the total.
         capacity: u32,
     }
+    /// One digit of a radix sort (`shaders/sort.wgsl`).
     SortSetup {
+        /// Lowest bit of the digit.
         shift: u32,
+        /// Counter that holds the number of keys.
         counter: u32,
+        /// Unused.
         pad: [u32; 2],
     }
+    /// Mode of `shaders/tile_lists.wgsl`.
     TileListsSetup {
+        /// 0 counts tile intersections, 1 writes them.
         emit: u32,
+        /// Unused.
         pad: [u32; 3],
     }
-    /// Which tiles a step samples (`shaders/sample_tiles.wgsl`).
+    /// Sampling of a step's tiles (`shaders/sample_tiles.wgsl`).
     TileSamplingSetup {
+        /// Share of the steps that sample a tile of mean loss; other tiles in proportion to theirs.
         share: f32,
+        /// Least share of the steps that sample a tile.
         min_share: f32,
+        /// Loss a pixel below which a tile has the least share.
         noise: f32,
+        /// λ of SSIM against L1.
         ssim_weight: f32,
+        /// Weight of the depth term, 1/metres.
         depth_weight: f32,
+        /// Seed of the step.
         seed: u32,
     }
+    /// Compaction of the map's planes (`shaders/gather.wgsl`).
     GatherSetup {
+        /// Gaussians that stay.
         count: u32,
+        /// Planes of four floats.
         planes: u32,
+        /// Gaussians that the source has space for.
         capacity_in: u32,
+        /// Gaussians that the destination has space for.
         capacity_out: u32,
     }
+    /// Weights of the image loss (`shaders/loss_*.wgsl`).
     LossSetup {
+        /// Image width, pixels.
         width: u32,
+        /// Image height, pixels.
         height: u32,
+        /// λ of SSIM against L1.
         ssim_weight: f32,
+        /// Weight of the depth term, 1/metres.
         depth_weight: f32,
+        /// Depth beyond which its weight falls with the square, metres.
         precise_depth: f32,
+        /// Confidence of the depth image, 0 to 1.
         depth_confidence: f32,
     }
-    /// What counts as a wrong pixel (`shaders/rasterize_scores.wgsl`).
+    /// High-error mask (`shaders/rasterize_scores.wgsl`).
     ScoreSetup {
+        /// Factor of the mean absolute error above which a pixel is a high-error one.
         error_ratio: f32,
+        /// Error below which no pixel is a high-error one.
         noise: f32,
+        /// λ of SSIM against L1.
         ssim_weight: f32,
+        /// Pixels of the image.
         pixels: f32,
     }
-    /// Step sizes by plane and lane, and decay rates (`shaders/shared/sink_adam.wgsl`).
+    /// Learning rates by plane and lane, and decay rates (`shaders/shared/sink_adam.wgsl`).
     AdamSetup {
+        /// Learning rates of the first five planes.
         rates: [[f32; 4]; 5],
+        /// Decay of the first moment.
         beta_1: f32,
+        /// Decay of the second moment.
         beta_2: f32,
+        /// Offset of the denominator.
         epsilon: f32,
+        /// Natural logarithm of `beta_1`.
         log_beta_1: f32,
+        /// Natural logarithm of `beta_2`.
         log_beta_2: f32,
+        /// Whether the higher harmonics take part in this step.
         step_harmonics: u32,
+        /// Logarithm of the largest ratio of a Gaussian's longest axis to its second.
         log_elongation: f32,
+        /// The colour's learning rate is divided by √(1 + this · steps of the Gaussian).
         color_settling: f32,
+        /// Least share of the newest parameters in their average.
         least_share: f32,
+        /// Unused.
         pad: [f32; 3],
     }
 }

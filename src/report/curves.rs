@@ -20,6 +20,9 @@ type Drawn = Result<(), Box<dyn std::error::Error>>;
 type Area<'a> = DrawingArea<SVGBackend<'a>, plotters::coord::Shift>;
 
 /// Whole-run time against ATE, held-out PSNR and Gaussians; white behind it.
+///
+/// # Errors
+/// The text of the drawing library, if it cannot draw.
 pub fn draw(points: &[Point]) -> Result<String, String> {
     const PANELS: [Figure; 3] = [Figure::Ate, Figure::Psnr, Figure::Gaussians];
     let mut svg = String::new();

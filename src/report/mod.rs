@@ -16,14 +16,29 @@ use crate::run_folder::{History, outputs};
 /// The report's name in the run's folder.
 pub const REPORT: &str = "report.html";
 
+/// A report that cannot be made.
 #[derive(Debug, thiserror::Error)]
 pub enum ReportError {
+    /// A file of the run cannot be read.
     #[error("cannot read {path}: {source}; give the folder of a run, with metrics.json in it")]
-    Read { path: PathBuf, source: std::io::Error },
+    Read {
+        /// The file or folder.
+        path: PathBuf,
+        /// The cause.
+        source: std::io::Error,
+    },
+    /// A file of the run is not what the program writes.
     #[error("{path} is not this version's ({source}); `keysplat eval` writes metrics.json and comparison.json anew")]
-    Parse { path: PathBuf, source: serde_json::Error },
+    Parse {
+        /// The file or folder.
+        path: PathBuf,
+        /// The cause.
+        source: serde_json::Error,
+    },
+    /// The drawing library failed.
     #[error("cannot draw: {0}; please report this")]
     Drawing(String),
+    /// The page cannot be written.
     #[error(transparent)]
     Write(#[from] WriteError),
 }

@@ -10,83 +10,124 @@ use crate::evaluation::Metrics;
 /// One run of a sweep.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SweepRow {
+    /// Name of the recording.
     pub sequence: String,
+    /// Name of the preset or variant.
     pub variant: String,
+    /// Seed of the mapper.
     pub seed: u64,
+    /// Frames replayed.
     pub frames: u64,
+    /// Frames with a pose.
     pub frames_tracked: u64,
     /// The whole run.
     pub wall_s: f64,
+    /// ATE RMSE over all frames, metres.
     pub ate_rmse_m: Option<f64>,
     /// Held-out views.
     pub psnr_db: Option<f64>,
+    /// Held-out SSIM.
     pub ssim: Option<f64>,
+    /// Held-out depth error, mean absolute, metres.
     pub depth_l1_m: Option<f64>,
+    /// Gaussians in the exported map.
     pub gaussians: Option<u64>,
+    /// Optimisation steps.
     pub iterations: Option<u64>,
+    /// Peak resident memory, bytes.
     pub peak_host_bytes: Option<u64>,
+    /// SHA-256 of the exported map.
     pub map_hash: Option<String>,
 }
 
 /// A sweep with the machine that it ran on: `sweep.json`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Sweep {
+    /// Name of the adapter.
     pub adapter: String,
+    /// Model name of the processor.
     pub cpu: Option<String>,
+    /// Hardware threads.
     pub threads: u64,
+    /// Version of keysplat.
     pub version: String,
+    /// All runs.
     pub rows: Vec<SweepRow>,
 }
 
 /// Median, least and most of some runs.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Spread {
+    /// Median.
     pub median: f64,
+    /// Minimum.
     pub least: f64,
+    /// Maximum.
     pub most: f64,
 }
 
 /// The runs of a variant on a sequence.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Point {
+    /// Name of the recording.
     pub sequence: String,
+    /// Name of the preset or variant.
     pub variant: String,
+    /// Runs of the point.
     pub runs: usize,
+    /// Time of a run, seconds.
     pub wall_s: Spread,
+    /// ATE RMSE, centimetres.
     pub ate_cm: Option<Spread>,
+    /// Held-out PSNR, dB.
     pub psnr_db: Option<Spread>,
+    /// Gaussians in the exported map.
     pub gaussians: Option<Spread>,
 }
 
 /// What is compared over time, and which way is better.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Figure {
+    /// Time of a run; lower is better.
     Time,
+    /// ATE RMSE; lower is better.
     Ate,
+    /// Held-out PSNR; higher is better.
     Psnr,
+    /// Size of the map; lower is better.
     Gaussians,
 }
 
 /// A figure that two sweeps have in common.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Change {
+    /// Name of the recording.
     pub sequence: String,
+    /// Name of the preset or variant.
     pub variant: String,
+    /// The figure compared.
     pub figure: Figure,
+    /// Spread of the earlier sweep.
     pub before: Spread,
+    /// Spread of the later sweep.
     pub after: Spread,
+    /// Direction of the change.
     pub verdict: Verdict,
 }
 
+/// Direction of a change.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Verdict {
+    /// Beyond the spread, for the better.
     Better,
+    /// Beyond the spread, for the worse.
     Worse,
     /// Within the spread.
     Same,
 }
 
 impl SweepRow {
+    /// The row of a run with these metrics.
     pub fn new(sequence: &str, variant: &str, seed: u64, m: &Metrics) -> Self {
         let held_out = m.images.held_out;
         Self {
@@ -120,8 +161,10 @@ impl Spread {
 }
 
 impl Figure {
+    /// All figures, in the order of tables.
     pub const ALL: [Self; 4] = [Self::Time, Self::Ate, Self::Psnr, Self::Gaussians];
 
+    /// Column heading with unit.
     pub fn name(self) -> &'static str {
         match self {
             Self::Time => "whole run, s",
@@ -131,6 +174,7 @@ impl Figure {
         }
     }
 
+    /// The figure's spread at a point; `None` where it was not measured.
     pub fn of(self, point: &Point) -> Option<Spread> {
         match self {
             Self::Time => Some(point.wall_s),

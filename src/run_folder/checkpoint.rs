@@ -35,13 +35,32 @@ pub enum CheckpointError {
     Mapping(#[from] MappingError),
     /// It cannot be read.
     #[error("cannot read {path}: {source}")]
-    Read { path: PathBuf, source: std::io::Error },
+    Read {
+        /// The file or folder.
+        path: PathBuf,
+        /// The cause.
+        source: std::io::Error,
+    },
     /// It is cut off or its digest differs.
     #[error("{path} is damaged or cut off, and nothing can be resumed from it; make the run anew with keysplat run")]
-    Damaged { path: PathBuf },
+    Damaged {
+        /// The file or folder.
+        path: PathBuf,
+    },
     /// It belongs to another run.
     #[error("{path} is of another run: {what} was {then} and is {now}; {advice}")]
-    Differs { path: PathBuf, what: String, then: String, now: String, advice: &'static str },
+    Differs {
+        /// The file or folder.
+        path: PathBuf,
+        /// The part that differs.
+        what: String,
+        /// Value in the checkpoint.
+        then: String,
+        /// Value of this run.
+        now: String,
+        /// What to do.
+        advice: &'static str,
+    },
 }
 
 /// Properties that a resumed run must share with its checkpoint.

@@ -41,7 +41,10 @@ pub enum Sensor {
     /// Colour and registered depth.
     Rgbd,
     /// Row-aligned pairs without distortion; the right camera is `baseline_metres` along the left one's x axis.
-    Stereo { baseline_metres: f64 },
+    Stereo {
+        /// Distance between the two cameras, metres.
+        baseline_metres: f64,
+    },
     /// Colour alone; lengths have no scale.
     Mono,
 }
@@ -50,8 +53,11 @@ pub enum Sensor {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
 #[serde(rename_all = "lowercase")]
 pub enum SensorKind {
+    /// Colour and depth.
     Rgbd,
+    /// Colour alone.
     Mono,
+    /// Rectified pairs.
     Stereo,
 }
 
@@ -66,6 +72,7 @@ impl std::fmt::Display for SensorKind {
 }
 
 impl Sensor {
+    /// The sensor without its measures.
     pub fn kind(self) -> SensorKind {
         match self {
             Self::Rgbd => SensorKind::Rgbd,
@@ -78,7 +85,9 @@ impl Sensor {
 /// A depth image; 0 where the sensor measured nothing.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DepthImage {
+    /// Pixels.
     pub width: u32,
+    /// Pixels.
     pub height: u32,
     /// Row-major `[height * width]`, metres along z.
     pub metres: Vec<f32>,
@@ -97,7 +106,9 @@ impl DepthImage {
 pub struct Frame {
     /// Position in the sequence as replayed (after `--every` and `--frames`).
     pub index: usize,
+    /// Seconds, by the clock of the recording.
     pub timestamp_s: f64,
+    /// sRGB.
     pub color: RgbImage,
     /// Registered to `color`, same size.
     pub depth: Option<DepthImage>,
@@ -108,9 +119,11 @@ pub struct Frame {
 /// Where one frame lies on disk.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FrameEntry {
+    /// Seconds, by the clock of the recording.
     pub timestamp_s: f64,
     /// An image; or the video whose frame at that time it is.
     pub color: PathBuf,
+    /// Depth image, if the frame has one.
     pub depth: Option<PathBuf>,
     /// The right image of a stereo pair.
     pub right: Option<PathBuf>,
@@ -128,11 +141,17 @@ pub struct KnownPoint {
 /// A recording, opened and checked: its camera, the list of its frames, and the truth where there is one.
 #[derive(Clone, Debug)]
 pub struct Sequence {
+    /// Name of the folder or file.
     pub name: String,
+    /// Dataset layout.
     pub layout: Layout,
+    /// The colour camera; the left one of a stereo pair.
     pub camera: Camera,
+    /// What each frame contains.
     pub sensor: Sensor,
+    /// Frames in order of time.
     pub entries: Vec<FrameEntry>,
+    /// True poses, where the recording has them.
     pub groundtruth: Option<Trajectory>,
     /// Points of the scene in the truth's world, where the recording has them.
     pub points: Vec<KnownPoint>,
@@ -142,40 +161,132 @@ pub struct Sequence {
     video: Option<Arc<Video>>,
 }
 
+/// A recording that cannot be opened or read.
 #[derive(Debug, thiserror::Error)]
 pub enum SequenceError {
+    /// There is no such file or folder.
     #[error("there is no folder or video {0}; give the folder that holds the recording, or its video")]
     Missing(PathBuf),
+    /// No dataset layout matches the folder.
     #[error("{0} is no recording in a layout that we know ({known}); check the folder, or name its layout with --layout", known = Layout::known())]
     UnknownLayout(PathBuf),
+    /// The file is no video.
     #[error("{path} is no video that we know (MP4, MOV, AVI, MKV, WebM); give one, or give the folder that holds the recording")]
-    NoVideo { path: PathBuf },
+    NoVideo {
+        /// The file or folder.
+        path: PathBuf,
+    },
+    /// A frame of the video cannot be decoded.
     #[error("frame {frame} of {path} cannot be decoded; the video is damaged, or was not copied whole")]
-    VideoFrame { path: PathBuf, frame: usize },
+    VideoFrame {
+        /// The file or folder.
+        path: PathBuf,
+        /// Frame of the replay, from 0.
+        frame: usize,
+    },
+    /// The recording lacks the requested sensor.
     #[error("{name} is a {found} recording and cannot be replayed as {wanted}; leave --sensor out, or say mono")]
-    NoSuchSensor { name: String, wanted: SensorKind, found: SensorKind },
+    NoSuchSensor {
+        /// Name of the recording.
+        name: String,
+        /// Requested sensor.
+        wanted: SensorKind,
+        /// Sensor of the recording.
+        found: SensorKind,
+    },
+    /// A file cannot be read.
     #[error("cannot read {path}: {source}")]
-    Read { path: PathBuf, source: std::io::Error },
+    Read {
+        /// The file or folder.
+        path: PathBuf,
+        /// The cause.
+        source: std::io::Error,
+    },
+    /// A line of a list cannot be parsed.
     #[error("{path}:{line}: {what}")]
-    Syntax { path: PathBuf, line: usize, what: String },
+    Syntax {
+        /// The file or folder.
+        path: PathBuf,
+        /// Line in the file, from 1.
+        line: usize,
+        /// What is wrong.
+        what: String,
+    },
+    /// A file contradicts its format.
     #[error("{path}: {what}")]
-    Content { path: PathBuf, what: String },
+    Content {
+        /// The file or folder.
+        path: PathBuf,
+        /// What is wrong.
+        what: String,
+    },
+    /// The recording has no frame.
     #[error("{path} lists no frames; check that the recording was copied whole")]
-    Empty { path: PathBuf },
+    Empty {
+        /// The file or folder.
+        path: PathBuf,
+    },
+    /// A list names an image that does not exist.
     #[error("{list}:{line}: there is no file {image}; check that the recording was copied whole")]
-    MissingImage { list: PathBuf, line: usize, image: PathBuf },
+    MissingImage {
+        /// The list.
+        list: PathBuf,
+        /// Line in the file, from 1.
+        line: usize,
+        /// The image that does not exist.
+        image: PathBuf,
+    },
+    /// The recording comes without a calibration.
     #[error("{folder}: no camera.txt, and the folder's name says no known camera ({known}); add camera.txt with `fx fy cx cy width height depth_units_per_metre k1 k2 p1 p2`, or name one with --camera", known = cameras::names().join(", "))]
-    NoCamera { folder: PathBuf },
+    NoCamera {
+        /// The recording.
+        folder: PathBuf,
+    },
+    /// No preset has that name, and no file either.
     #[error("no camera is called `{name}`; known are {known}; for a video, give the path of a camera.toml", known = cameras::names().join(", "))]
-    UnknownCamera { name: String },
+    UnknownCamera {
+        /// The name given.
+        name: String,
+    },
+    /// An image's size is not the camera's.
     #[error("{path} is {found_width}x{found_height}, but the camera is {width}x{height}; images, depth and camera must agree")]
-    Size { path: PathBuf, width: u32, height: u32, found_width: u32, found_height: u32 },
+    Size {
+        /// The file or folder.
+        path: PathBuf,
+        /// Expected pixels.
+        width: u32,
+        /// Expected pixels.
+        height: u32,
+        /// Pixels.
+        found_width: u32,
+        /// Pixels.
+        found_height: u32,
+    },
+    /// An image cannot be decoded.
     #[error("cannot decode {path}: {source}")]
-    Image { path: PathBuf, source: image::ImageError },
+    Image {
+        /// The file or folder.
+        path: PathBuf,
+        /// The cause.
+        source: image::ImageError,
+    },
+    /// A depth image is not 16-bit grey.
     #[error("{path} is no 16-bit grey image; depth must be one")]
-    DepthFormat { path: PathBuf },
+    DepthFormat {
+        /// The file or folder.
+        path: PathBuf,
+    },
+    /// No frame is in the range selected.
     #[error("frames {start}..{end} is outside the sequence of {len} frames; give --frames A..B within 0..{len}")]
-    Range { start: usize, end: usize, len: usize },
+    Range {
+        /// First frame selected.
+        start: usize,
+        /// Frame after the last one selected.
+        end: usize,
+        /// Frames of the recording.
+        len: usize,
+    },
+    /// The ground truth cannot be read.
     #[error(transparent)]
     Groundtruth(#[from] TrajectoryError),
 }
@@ -187,6 +298,9 @@ impl Sequence {
     /// Opens a recording, a folder or a video: finds its layout unless named, reads and checks its lists, camera and truth. No image is
     /// decoded, but a video is, once, for the times of its frames.
     /// `camera` names a preset (`tum-fr1`, …) to use instead of what a folder in TUM's layout says; for a video, also a `camera.toml`.
+    ///
+    /// # Errors
+    /// [`SequenceError`] if the recording does not exist, has no known layout or camera, or a file of it is damaged; the message names the file.
     pub fn open(folder: &Path, layout: Option<Layout>, camera: Option<&str>) -> Result<Self, SequenceError> {
         let video = Layout::of(&video::LAYOUT);
         if folder.is_file() && layout.is_none_or(|layout| layout == video) {
@@ -215,6 +329,9 @@ impl Sequence {
     }
 
     /// Takes from the recording only what a sensor of this kind gives: a monocular replay of an RGB-D recording leaves its depth out.
+    ///
+    /// # Errors
+    /// [`SequenceError::NoSuchSensor`] if the recording lacks that sensor.
     pub fn restrict_to(&mut self, kind: SensorKind) -> Result<(), SequenceError> {
         if kind == self.sensor.kind() {
             return Ok(());
@@ -230,6 +347,9 @@ impl Sequence {
     }
 
     /// Keeps frames `start..end` (the end clipped to the sequence), then every `every`-th of these.
+    ///
+    /// # Errors
+    /// [`SequenceError::Range`] if no frame is left.
     pub fn select(&mut self, range: Option<std::ops::Range<usize>>, every: usize) -> Result<(), SequenceError> {
         let len = self.entries.len();
         let range = range.unwrap_or(0..len);
@@ -250,6 +370,9 @@ impl Sequence {
     }
 
     /// Decodes frame `index`. In a video this is quick for the frames after the last one loaded; any other begins at the first again.
+    ///
+    /// # Errors
+    /// [`SequenceError`] if an image is missing, damaged, or not of the camera's size.
     pub fn load(&self, index: usize) -> Result<Frame, SequenceError> {
         let entry = &self.entries[index];
         let color = match &self.video {

@@ -12,8 +12,11 @@ const SAME_SURFACE: f32 = 0.03;
 /// A frame seen through an ideal pinhole.
 #[derive(Clone, Debug)]
 pub struct RectifiedImage {
+    /// The ideal pinhole, at the mapping resolution.
     pub pinhole: Pinhole,
+    /// sRGB, of the pinhole's size.
     pub color: RgbImage,
+    /// Depth of the same pixels, where the sensor has it.
     pub depth: Option<DepthImage>,
 }
 
@@ -64,6 +67,7 @@ impl Rectifier {
         Self { pinhole, sources, samples, scale }
     }
 
+    /// The ideal pinhole of the rectified images.
     pub fn pinhole(&self) -> Pinhole {
         self.pinhole
     }

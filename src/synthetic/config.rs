@@ -10,13 +10,19 @@ use super::SceneError;
 pub struct SceneConfig {
     /// Decides the furnishing, the textures, the hand's shake and the sensor's noise.
     pub seed: u64,
+    /// Frames rendered.
     pub frames: usize,
     /// Frames per second.
     pub fps: f64,
+    /// Recording camera.
     pub camera: CameraConfig,
+    /// Size and gloss of the room.
     pub room: RoomConfig,
+    /// Pieces of furniture.
     pub furniture: FurnitureConfig,
+    /// Path of the camera.
     pub path: PathConfig,
+    /// Faults of the sensor.
     pub degradation: DegradationConfig,
 }
 
@@ -39,15 +45,25 @@ impl Default for SceneConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CameraConfig {
+    /// Image width.
     pub width: u32,
+    /// Image height.
     pub height: u32,
+    /// Focal length along x.
     pub fx: f64,
+    /// Focal length along y.
     pub fy: f64,
+    /// Principal point, x.
     pub cx: f64,
+    /// Principal point, y.
     pub cy: f64,
+    /// Radial distortion, second order.
     pub k1: f64,
+    /// Radial distortion, fourth order.
     pub k2: f64,
+    /// Tangential distortion, along y.
     pub p1: f64,
+    /// Tangential distortion, along x.
     pub p2: f64,
 }
 
@@ -62,8 +78,11 @@ impl Default for CameraConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RoomConfig {
+    /// Along the world's x axis.
     pub width: f64,
+    /// Along the world's z axis.
     pub depth: f64,
+    /// Floor to ceiling.
     pub height: f64,
     /// 0 for purely diffuse surfaces, whose look does not depend on where one stands; up to 1 for highlights on wood, glaze, metal.
     pub gloss: f64,
@@ -81,17 +100,23 @@ impl Default for RoomConfig {
 pub struct FurnitureConfig {
     /// Desks and dining tables in turn.
     pub tables: usize,
+    /// Bookshelves.
     pub shelves: usize,
+    /// Sofas.
     pub sofas: usize,
+    /// Cabinets.
     pub cabinets: usize,
     /// Standard lamps.
     pub lamps: usize,
+    /// Potted plants.
     pub plants: usize,
     /// Stacks of packing boxes.
     pub boxes: usize,
+    /// Rugs.
     pub rugs: usize,
     /// Posters and paintings on the walls.
     pub pictures: usize,
+    /// Windows.
     pub windows: usize,
 }
 
@@ -101,6 +126,7 @@ impl Default for FurnitureConfig {
     }
 }
 
+/// Shape of the camera's path.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum PathKind {
@@ -110,9 +136,11 @@ pub enum PathKind {
     Loop,
 }
 
+/// The camera's path.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct PathConfig {
+    /// Shape of the path.
     pub kind: PathKind,
     /// Times round the room, for a loop; the last frame is back at the start.
     pub rounds: u32,
@@ -125,6 +153,7 @@ pub struct PathConfig {
     pub height: f64,
     /// The hand's shake: about its largest excursion, in metres and in degrees.
     pub shake_metres: f64,
+    /// Largest rotation of the shake, degrees.
     pub shake_degrees: f64,
 }
 
@@ -166,6 +195,9 @@ const MAX_FRAMES: usize = 108_000;
 
 impl SceneConfig {
     /// Checks each field on its own; whether the furniture fits and the path is clear shows when the scene is built.
+    ///
+    /// # Errors
+    /// [`SceneError::Field`] or [`SceneError::TooFewFrames`] with the key that is out of range.
     pub fn validate(&self) -> Result<(), SceneError> {
         self.validate_camera()?;
         let room = &self.room;

@@ -44,43 +44,110 @@ const BLUR_MOMENTS: usize = 9;
 /// Poses of the path that furnishing looks at.
 const PATH_SAMPLES: usize = 160;
 
+/// A scene that cannot be rendered or written.
 #[derive(Debug, thiserror::Error)]
 pub enum SceneError {
+    /// The scene file cannot be read.
     #[error("cannot read {path}: {source}")]
-    Read { path: PathBuf, source: std::io::Error },
+    Read {
+        /// The file or folder.
+        path: PathBuf,
+        /// The cause.
+        source: std::io::Error,
+    },
+    /// Not TOML, an unknown key, or a value of the wrong type.
     #[error("{path}: {source}")]
-    Syntax { path: PathBuf, source: Box<toml::de::Error> },
+    Syntax {
+        /// The file or folder.
+        path: PathBuf,
+        /// The cause.
+        source: Box<toml::de::Error>,
+    },
+    /// An error in a scene file.
     #[error("{path}: {source}")]
-    In { path: PathBuf, source: Box<SceneError> },
+    In {
+        /// The file or folder.
+        path: PathBuf,
+        /// The cause.
+        source: Box<SceneError>,
+    },
+    /// A value out of its range.
     #[error("`{field}` {what}")]
-    Field { field: &'static str, what: String },
+    Field {
+        /// Key in the scene file.
+        field: &'static str,
+        /// What is wrong.
+        what: String,
+    },
+    /// The rounds need more frames.
     #[error(
         "`frames` is {frames}, too few for {rounds} rounds at the allowed pace; give at least {needed}, or raise `path.speed` and `path.turn_rate`"
     )]
-    TooFewFrames { rounds: u32, frames: usize, needed: usize },
+    TooFewFrames {
+        /// Rounds of the path.
+        rounds: u32,
+        /// Frames of the scene.
+        frames: usize,
+        /// Value needed.
+        needed: usize,
+    },
+    /// The room is full.
     #[error("`{field}`: there is no place for number {index}; ask for fewer pieces, a larger `room`, or another `seed`")]
-    NoPlace { field: &'static str, index: usize },
+    NoPlace {
+        /// Key in the scene file.
+        field: &'static str,
+        /// Index in the map.
+        index: usize,
+    },
+    /// The path comes too close to a surface.
     #[error(
         "frame {frame} would be {distance_metres:.2} m from a surface, nearer than {limit} m; enlarge the `room` or lower `path.shake_metres`",
         limit = room::MIN_CLEARANCE
     )]
-    TooClose { frame: usize, distance_metres: f64 },
+    TooClose {
+        /// Frame of the replay, from 0.
+        frame: usize,
+        /// Distance from the surface, metres.
+        distance_metres: f64,
+    },
+    /// The output folder exists.
     #[error("{path} is there already; remove it or write elsewhere")]
-    Exists { path: PathBuf },
+    Exists {
+        /// The file or folder.
+        path: PathBuf,
+    },
+    /// A file cannot be written.
     #[error("cannot write {path}: {source}; check that the folder may be written and has space")]
-    Write { path: PathBuf, source: std::io::Error },
+    Write {
+        /// The file or folder.
+        path: PathBuf,
+        /// The cause.
+        source: std::io::Error,
+    },
+    /// An image cannot be encoded.
     #[error("cannot encode {path}: {source}")]
-    Image { path: PathBuf, source: image::ImageError },
+    Image {
+        /// The file or folder.
+        path: PathBuf,
+        /// The cause.
+        source: image::ImageError,
+    },
 }
 
 impl SceneConfig {
     /// Reads and checks a scene file.
+    ///
+    /// # Errors
+    /// [`SceneError`] if the file cannot be read or parsed, or a value is out of range.
     pub fn read(path: &Path) -> Result<Self, SceneError> {
         let text = std::fs::read_to_string(path).map_err(|source| SceneError::Read { path: path.into(), source })?;
         Self::parse(&text, path)
     }
 
     /// The same of a text; `path` is named in errors.
+    ///
+    /// # Errors
+    /// As [`Self::read`], except for reading.
     pub fn parse(text: &str, path: &Path) -> Result<Self, SceneError> {
         let config: Self =
             toml::from_str(text).map_err(|source| SceneError::Syntax { path: path.into(), source: Box::new(source) })?;
@@ -188,6 +255,9 @@ impl<'a> Recording<'a> {
 
 /// Renders `config` into the new folder `out`, in parallel; `progress` is called after each frame. The same scene gives the same
 /// bytes, however many threads there are. A run that fails or is killed leaves no folder `out`.
+///
+/// # Errors
+/// [`SceneError`] if the scene has no place for its furniture, the path comes too close to a surface, `out` exists, or writing fails.
 pub fn generate(config: &SceneConfig, out: &Path, progress: &(dyn Fn(usize, usize) + Sync)) -> Result<(), SceneError> {
     config.validate()?;
     let writer = write::Writer::new(out)?;

@@ -16,9 +16,9 @@ pub struct TrackingConfig {
     pub fast_threshold: u8,
     /// FAST threshold where the image has no corner at `fast_threshold`.
     pub fast_threshold_low_texture: u8,
-    /// Depths nearer than this are not believed.
+    /// Least valid depth.
     pub min_depth_metres: f64,
-    /// Depths beyond this are not believed.
+    /// Largest valid depth.
     pub max_depth_metres: f64,
     /// Standard deviation of a keypoint's position at the finest pyramid level, pixels. Coarser levels scale it.
     pub pixel_sigma: f64,
@@ -27,7 +27,7 @@ pub struct TrackingConfig {
     pub inverse_depth_sigma: f64,
     /// Standard deviation of a stereo disparity at the finest pyramid level, pixels. Coarser levels scale it.
     pub disparity_sigma: f64,
-    /// A depth whose 3x3 neighbourhood spans more than this share of it lies on an edge and is not believed.
+    /// A depth whose 3x3 neighbourhood spans more than this share of it lies on an edge and is dropped.
     pub depth_edge_ratio: f64,
     /// Landmarks that the first frame must give before there is a map.
     pub min_initial_landmarks: usize,
@@ -82,6 +82,9 @@ impl Default for TrackingConfig {
 
 impl TrackingConfig {
     /// Checks every value; the message names the field and what it may be.
+    ///
+    /// # Errors
+    /// The key that is out of range, and its range.
     pub fn validate(&self) -> Result<(), String> {
         let count = |name: &str, value: usize, low: usize, high: usize| {
             let good = (low..=high).contains(&value);

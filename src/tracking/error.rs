@@ -3,21 +3,51 @@
 /// Errors of the tracker.
 #[derive(Debug, thiserror::Error)]
 pub enum TrackingError {
+    /// A setting out of its range.
     #[error("{0}")]
     Config(String),
+    /// An RGB-D recording begins without depth.
     #[error(
         "frame {frame} is the first and has no depth image; the map is started from depth, so begin at a frame that has one \
          or give the recording's depth"
     )]
-    FirstFrameWithoutDepth { frame: usize },
+    FirstFrameWithoutDepth {
+        /// Frame of the replay, from 0.
+        frame: usize,
+    },
+    /// An image's size is not the camera's.
     #[error("frame {frame}: its {what} image is {found_width}x{found_height}, but the camera is {width}x{height}")]
-    Size { frame: usize, what: &'static str, width: u32, height: u32, found_width: u32, found_height: u32 },
+    Size {
+        /// Frame of the replay, from 0.
+        frame: usize,
+        /// `colour` or `depth`.
+        what: &'static str,
+        /// Expected pixels.
+        width: u32,
+        /// Expected pixels.
+        height: u32,
+        /// Pixels.
+        found_width: u32,
+        /// Pixels.
+        found_height: u32,
+    },
+    /// A relative pose of keyframes is invalid.
     #[error("the pose of keyframe {keyframe} relative to {relative_to} is refused: {problem}")]
-    Measurement { keyframe: usize, relative_to: usize, problem: String },
+    Measurement {
+        /// The measured keyframe.
+        keyframe: usize,
+        /// The reference keyframe.
+        relative_to: usize,
+        /// What is wrong with it.
+        problem: String,
+    },
+    /// The system gave no thread.
     #[error("the thread for bundle adjustment could not be started: {0}")]
     Spawn(#[source] std::io::Error),
+    /// The adjustment thread panicked.
     #[error("the thread for bundle adjustment panicked; what was tracked until then is kept. Please report this")]
     Adjusting,
+    /// OpenCV failed.
     #[error("OpenCV failed while extracting features: {0}")]
     OpenCv(#[from] opencv::Error),
 }

@@ -4,7 +4,7 @@
 //! One frame: features, with depth where the sensor gives it → the pose predicted from the last motion → last frame's points → the local
 //! map; all pixels where features are too few (RGB-D). Now and then a keyframe: landmarks from depth and by triangulation, joined with
 //! what its neighbours see → local bundle adjustment in a thread beside → loop closing → culling of what became redundant. Only the
-//! caller's thread changes the map, and unpaced it does so in one fixed order: the same frames give the same bits. Knows nothing of the
+//! caller's thread changes the map, and in deterministic replay it does so in one fixed order: the same frames give the same bits. Knows nothing of the
 //! mapper or the GPU.
 
 mod adjustment;
@@ -32,14 +32,16 @@ use crate::geometry::{Se3, StampedPose};
 /// Whether a frame has a pose.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum TrackingState {
+    /// The frame has a pose.
     Tracking,
     /// No pose that can be trusted; the frame left no trace in the map.
     Lost,
 }
 
-/// What tracking says of one frame.
+/// Result of tracking one frame.
 #[derive(Clone, Debug)]
 pub struct TrackedFrame {
+    /// Whether the frame has a pose.
     pub state: TrackingState,
     /// As of now; later keyframe corrections move it (see [`Tracker::trajectory`]). `None` when lost.
     pub world_from_camera: Option<Se3>,
@@ -49,7 +51,7 @@ pub struct TrackedFrame {
     pub keyframe: Option<NewKeyframe>,
     /// Earlier keyframes that bundle adjustment or a closed loop moved, as they were taken in with this frame: id, new world_from_camera.
     pub updates: Vec<(usize, Se3)>,
-    /// Where the time went; the only part of the answer that differs from run to run.
+    /// Time of each stage; the only field that differs between identical runs.
     pub times: StageTimes,
 }
 
@@ -70,13 +72,18 @@ pub struct NewKeyframe {
 /// A keyframe as currently estimated.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct KeyframePose {
+    /// Number in the order of creation, from 0.
     pub id: usize,
+    /// Index of its frame in the replay.
     pub frame_index: usize,
+    /// Seconds, by the clock of the recording.
     pub timestamp_s: f64,
+    /// Pose, metres.
     pub world_from_camera: Se3,
 }
 
 impl KeyframePose {
+    /// The pose with its time, without the keyframe's number.
     pub fn stamped(&self) -> StampedPose {
         StampedPose { timestamp_s: self.timestamp_s, world_from_camera: self.world_from_camera }
     }
@@ -91,13 +98,14 @@ pub struct StageTimes {
     pub localise_ms: f64,
     /// New landmarks, joining with neighbours.
     pub mapping_ms: f64,
-    /// What bundle adjustment costs this thread: putting it together, waiting for it, taking it in.
+    /// Bundle adjustment in the tracking thread: assembling, waiting, applying.
     pub bundle_ms: f64,
     /// Looking for a loop, and closing it.
     pub loops_ms: f64,
 }
 
 impl StageTimes {
+    /// Sum of all stages, milliseconds.
     pub fn total_ms(&self) -> f64 {
         self.features_ms + self.localise_ms + self.mapping_ms + self.bundle_ms + self.loops_ms
     }

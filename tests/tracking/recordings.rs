@@ -147,7 +147,7 @@ fn a_walk_through_a_textured_room_is_recovered_the_same_each_time() {
 #[test]
 fn paced_tracking_takes_adjustments_in_when_they_are_ready() {
     let frames: Vec<Frame> = (0..16).map(|i| render(i, &truth(i))).collect();
-    let (tracker, answers) = run(tracker().paced(true), &frames);
+    let (tracker, answers) = run(tracker().real_time(true), &frames);
     for (index, pose) in tracker.trajectory() {
         assert_close(&pose.world_from_camera, index);
     }

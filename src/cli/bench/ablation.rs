@@ -63,7 +63,7 @@ pub(super) fn ablation(args: &AblationArgs) -> miette::Result<()> {
     let base = recording.config();
     let given = Variant { name: "as given".into(), settings: Vec::new() };
     let variants = if args.variants.is_empty() { std::slice::from_ref(&given) } else { &args.variants };
-    // A wrong setting is told before anything is done.
+    // A wrong setting fails before anything runs.
     let configs: Vec<Config> =
         variants.iter().map(|v| base.with_settings(&v.settings)).collect::<Result<_, _>>().into_diagnostic()?;
     std::fs::create_dir_all(&args.run.out).into_diagnostic()?;

@@ -24,7 +24,7 @@ const SCENES: [(&str, &str); 3] = [
 ];
 /// What made a run, in its folder: a run of the same is not made again.
 const MADE_BY: &str = "made-by.json";
-/// Where neither numbers of steps nor presets are asked for.
+/// Default, without numbers of steps or presets.
 const USUAL_STEPS: [usize; 4] = [12, 25, 50, 100];
 
 #[derive(Args)]

@@ -1,6 +1,6 @@
 //! COLMAP's binary models: little-endian records behind a count.
 //!
-//! Read in order, never whole: observations and tracks are skipped. A count is believed only if its records fit into what is left of
+//! Read in order, never whole: observations and tracks are skipped. A count is accepted only if its records fit into what is left of
 //! the file, so that a damaged header allocates nothing.
 
 use std::fs::File;

@@ -25,7 +25,7 @@ use container::Container;
 use decoder::Decoder;
 
 const EXTENSIONS: [&str; 7] = ["mp4", "m4v", "mov", "3gp", "avi", "mkv", "webm"];
-/// Nine hours at 30 Hz. A cut file's header that claims more frames is damaged itself, and not believed.
+/// Nine hours at 30 Hz. A cut file's header that claims more frames is damaged itself.
 const MOST_MISSING: usize = 1_000_000;
 /// Frames that a decoder holds back: 16 to put them in order (H.264), and one for each of its threads.
 const MOST_DELAYED: usize = 32;

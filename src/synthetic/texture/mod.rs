@@ -80,7 +80,7 @@ impl Material {
         }
     }
 
-    /// How glossy the material is when gloss is asked for, `0..1`.
+    /// Gloss of the material where the scene has gloss, `0..1`.
     pub fn gloss(&self) -> f32 {
         match self {
             Self::Wood { .. } | Self::Poster => 0.5,

@@ -71,7 +71,7 @@ impl Drop for Worker {
     fn drop(&mut self) {
         self.jobs = None;
         if let Some(thread) = self.thread.take() {
-            // A panic in it was told when it was waited for.
+            // A panic was reported when its result was due.
             let _ = thread.join();
         }
     }

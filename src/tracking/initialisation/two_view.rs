@@ -19,7 +19,7 @@ const RANSAC_ITERATIONS: i32 = 1000;
 /// χ² at 95% for 1 and 2 degrees of freedom; a match scores by how far it is below the second.
 const CHI2_LINE: f64 = 3.841;
 const CHI2_PIXEL: f64 = 5.991;
-/// Share of the score from which on a homography is believed.
+/// Share of the score from which on the homography is chosen.
 const HOMOGRAPHY_SHARE: f64 = 0.45;
 /// Points that a motion must give, and the share of the inliers that they must be.
 const MIN_POINTS: usize = 50;

@@ -19,7 +19,7 @@ use crate::tracking::solvers::residual::InlierClass;
 const MOTION_RADII: [f64; 3] = [8.0, 16.0, 32.0];
 const MOTION_SEARCH: ProjectionSearch =
     ProjectionSearch { taken: &[], coarser_octaves: 1, rules: Rules { max_distance: 80, ratio: 0.9, check_rotation: true } };
-/// Matches with which a search is wide enough, and inliers with which its pose is believed enough to look at the map.
+/// Matches that end the widening of the search, and least inliers of its pose.
 const MOTION_MATCHES: usize = 40;
 const MOTION_INLIERS: usize = 15;
 /// Inliers that make it worth to look more closely around a rough pose.

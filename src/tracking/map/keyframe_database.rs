@@ -1,7 +1,7 @@
 //! Recognising places: which keyframes show what a frame shows, from binary descriptors alone and without a vocabulary learnt before.
 //!
 //! A binary search tree over Hamming space that grows with the map, after the idea of Schlegel & Grisetti (*HBST: a Hamming distance
-//! embedding binary search tree for feature-based visual place recognition*, RA-L 2018): an inner node asks for one bit, a leaf that
+//! embedding binary search tree for feature-based visual place recognition*, RA-L 2018): an inner node tests one bit, a leaf that
 //! has become too full is split on the bit that halves it best. Noise flips bits, and a query with one
 //! flipped on its way ends in a strange leaf: it finds a part of what there is, which ranks keyframes as well as all of it would.
 
@@ -105,7 +105,7 @@ impl KeyframeDatabase {
         let next = self.nodes.len();
         let Node::Leaf(entries) = &mut self.nodes[node] else { return };
         entries.push(entry);
-        // What could not be split is asked again when it has doubled.
+        // A leaf that could not be split is tried again when it has doubled.
         if entries.len() < LEAF_CAPACITY
             || !(entries.len() / LEAF_CAPACITY).is_power_of_two()
             || entries.len() % LEAF_CAPACITY > 0

@@ -69,7 +69,7 @@ struct System {
 
 impl BundleProblem {
     /// Moves poses and points to lower the cost, `steps` Levenberg-Marquardt steps at most. Returns the cost before and after.
-    /// Observations of points that lie behind their cameras to begin with are outliers until they are judged anew.
+    /// Observations of points that lie behind their cameras to begin with are outliers until the next classification.
     pub fn solve(&mut self, pinhole: &Pinhole, steps: usize) -> (f64, f64) {
         for o in &mut self.observations {
             if o.measurement.residual(pinhole, &(self.poses[o.pose] * self.points[o.point]).coords).is_none() {

@@ -1,6 +1,6 @@
 //! The pose of one camera from known points: robust Levenberg-Marquardt on SE(3) with a left perturbation.
 //!
-//! Several rounds; after each, every measurement is judged anew by χ² and may come back. Early rounds use Huber's kernel
+//! Several rounds; after each, every measurement is classified anew by χ² and may come back. Early rounds use Huber's kernel
 //! (Mur-Artal & Tardós, *ORB-SLAM2*, 2017, sec. III-C). A measurement whose depth alone disagrees keeps its pixel.
 
 use nalgebra::{Matrix3, Matrix6, Point3, Vector3, Vector6};
@@ -10,7 +10,7 @@ use crate::tracking::solvers::residual::{InlierClass, Measurement, point_by_pose
 
 const ROUNDS: usize = 4;
 const STEPS_PER_ROUND: usize = 8;
-/// The last rounds run on what was judged good, without Huber's kernel.
+/// The last rounds run on inliers, without Huber's kernel.
 const ROBUST_ROUNDS: usize = 2;
 /// Steps below this (metres and radians together) have converged.
 const CONVERGED: f64 = 1e-7;

@@ -16,14 +16,17 @@ const MAX_SIGMA_METRES: f64 = 10.0;
 const MAX_METRES: f64 = 1e4;
 /// Errors beyond this many standard deviations pull less and less.
 const HUBER_SIGMAS: f64 = 3.0;
-/// Errors that are still beyond this many where the landmarks have settled are not believed.
+/// Gate: factors with a larger error after the landmarks converged are rejected.
 const GATE_SIGMAS: f64 = 6.0;
 
 /// A measured pose of one keyframe in the frame of another.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PoseMeasurement {
+    /// The measured keyframe.
     pub keyframe: usize,
+    /// The reference keyframe.
     pub relative_to: usize,
+    /// The measured pose, metres.
     pub keyframe_from_relative: Se3,
     /// Standard deviation of each coordinate of the translation, in the keyframe's frame.
     pub sigma_translation_metres: f64,

@@ -31,7 +31,7 @@ pub struct Measurement {
     pub depth_weight: f64,
 }
 
-/// How far a measurement may be believed.
+/// Inlier class of a measurement, by the χ² gate.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum InlierClass {
     /// All that was measured.

@@ -24,7 +24,7 @@ const MISSED: f64 = 1e-3;
 const ROUGH_FACTOR: f64 = 3.0;
 /// Fewer pairs than this agree by chance.
 const MIN_INLIERS: usize = 12;
-/// Standard deviation of the distance at which a keyframe without depth believes a point, as a share of it. Common errors of all points are
+/// Standard deviation of the distance of a point in a keyframe without depth, as a share of it. Common errors of all points are
 /// the scale that is looked for; this is what remains of each.
 const KNOWN_DISTANCE_SIGMA: f64 = 0.1;
 const ROUNDS: usize = 3;
@@ -135,7 +135,7 @@ impl Pair {
         [in_a, in_b]
     }
 
-    /// The same, with what the keyframes believe of the point's depth as measured where nothing is.
+    /// The same; where no depth was measured, the landmark's own depth stands in.
     fn with_known_distances(&self) -> Self {
         let known = |m: Measurement, depth: f64| match m.inverse_depth {
             Some(_) => m,

@@ -1,8 +1,8 @@
 //! Bundle adjustment beside tracking: when it begins, when its result is taken into the map, and what follows then: the search for a
 //! loop, and the culling of keyframes.
 //!
-//! One adjustment is under way at a time, and everything that changes the map happens here, in the tracking thread. Unpaced, a result is
-//! taken in at a fixed frame, or before the next keyframe is made, so that replay repeats to the bit. Paced, it is taken in when it is
+//! One adjustment is under way at a time, and everything that changes the map happens here, in the tracking thread. In deterministic replay a result is
+//! taken in at a fixed frame, or before the next keyframe is made, so that replay is bit-reproducible. In real time it is taken in when it is
 //! ready, and keyframes that come meanwhile wait for the next adjustment, which takes them along.
 
 use std::time::Instant;
@@ -15,7 +15,7 @@ use crate::tracking::adjustment::thread::Worker;
 use crate::tracking::map::keyframe_culling::cull_around;
 use crate::tracking::{PoseMeasurement, StageTimes, TrackingError};
 
-/// Unpaced: frames after its keyframe at which an adjustment is taken in, at most, and as a share of those since the keyframe before:
+/// Deterministic replay: frames after its keyframe at which an adjustment is taken in, at most, and as a share of those since the keyframe before:
 /// where keyframes follow each other closely the map must not lag behind. Points that were only triangulated are poor until they are
 /// adjusted: without depth it is always the next frame.
 const TAKEN_IN_AFTER: usize = 3;
@@ -25,7 +25,7 @@ const TAKEN_IN_SHARE: usize = 4;
 #[derive(Debug)]
 pub(super) struct Adjusting {
     worker: Worker,
-    pub paced: bool,
+    pub real_time: bool,
     under_way: Option<UnderWay>,
     /// The frame, counted from 1, at which the newest keyframe was made, and frames since the one before.
     newest_at: usize,
@@ -38,7 +38,7 @@ pub(super) struct Adjusting {
 struct UnderWay {
     /// The keyframe whose surroundings it adjusts; `None` for all keyframes, after a loop.
     around: Option<usize>,
-    /// Unpaced: the frame, counted from 1, at which it is taken in.
+    /// Deterministic replay: the frame, counted from 1, at which it is taken in.
     due: usize,
 }
 
@@ -51,7 +51,7 @@ struct Waiting {
 
 impl Adjusting {
     pub fn new(worker: Worker) -> Self {
-        Self { worker, paced: false, newest_at: 0, interval: 0, under_way: None, waiting: None }
+        Self { worker, real_time: false, newest_at: 0, interval: 0, under_way: None, waiting: None }
     }
 }
 
@@ -66,8 +66,8 @@ impl Tracker {
         Ok(self.updates())
     }
 
-    /// Takes in relative poses of keyframes that someone else has measured, each in place of an earlier one of the same pair. The next
-    /// adjustments of these keyframes heed them.
+    /// Takes in relative poses of keyframes measured elsewhere, each in place of an earlier one of the same pair. The next
+    /// adjustments of these keyframes contain them as factors.
     ///
     /// # Errors
     /// [`TrackingError::Measurement`] if one has a number that is not finite or out of range, or an unknown keyframe; then none is taken.
@@ -88,7 +88,7 @@ impl Tracker {
     /// Takes in what has been adjusted, if it is time for it.
     pub(super) fn take_adjusted(&mut self, times: &mut StageTimes) -> Result<(), TrackingError> {
         let Some(under_way) = self.adjusting.under_way else { return Ok(()) };
-        if self.adjusting.paced {
+        if self.adjusting.real_time {
             let solved = self.adjusting.worker.poll()?;
             return solved.map_or(Ok(()), |solved| self.take_in(under_way, &solved, times));
         }
@@ -103,9 +103,9 @@ impl Tracker {
         Ok(())
     }
 
-    /// Before a keyframe is made: unpaced, the one before must be settled; paced never waits.
+    /// Before a keyframe is created: deterministic replay waits for the previous adjustment, real time never.
     pub(super) fn settle_for_keyframe(&mut self, times: &mut StageTimes) -> Result<(), TrackingError> {
-        if self.adjusting.paced { Ok(()) } else { self.take_all_adjusted(times) }
+        if self.adjusting.real_time { Ok(()) } else { self.take_all_adjusted(times) }
     }
 
     fn wait_for(&mut self, under_way: UnderWay, times: &mut StageTimes) -> Result<(), TrackingError> {
@@ -201,7 +201,7 @@ impl Tracker {
         }
     }
 
-    /// Keyframes that moved since this was last asked: id, new world_from_camera.
+    /// Keyframes that moved since the last call: id, new world_from_camera.
     pub(super) fn updates(&mut self) -> Vec<(usize, Se3)> {
         let pose = |k: usize| self.map.keyframes[k].camera_from_world.inverse();
         std::mem::take(&mut self.moved).into_iter().map(|k| (k, pose(k))).collect()

@@ -135,11 +135,11 @@ impl Tracker {
         })
     }
 
-    /// Paced replay, where frames do not wait: bundle adjustment is taken in when it is ready instead of at a fixed frame. What comes
-    /// out then depends on how fast the machine is.
+    /// Real-time replay: the result of bundle adjustment is applied when it is ready instead of at a fixed frame, so the poses depend on
+    /// the machine's speed.
     #[must_use]
-    pub fn paced(mut self, paced: bool) -> Self {
-        self.adjusting.paced = paced;
+    pub fn real_time(mut self, real_time: bool) -> Self {
+        self.adjusting.real_time = real_time;
         self
     }
 
@@ -333,7 +333,7 @@ impl Tracker {
         Ok(Some(self.describe(id)))
     }
 
-    /// What the mapper is told of a keyframe.
+    /// The keyframe's message to the mapper.
     fn describe(&self, id: usize) -> NewKeyframe {
         let keyframe = &self.map.keyframes[id];
         let depth = |l: usize| (keyframe.camera_from_world * self.map.landmarks[l].position).z;

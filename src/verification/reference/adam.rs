@@ -3,17 +3,24 @@
 /// Moments, step count and averaged parameters of one Gaussian.
 #[derive(Clone, Debug, Default)]
 pub struct Adam64 {
+    /// First moments, one a parameter.
     pub first: Vec<f64>,
+    /// Second moments, one a parameter.
     pub second: Vec<f64>,
+    /// Steps with a gradient.
     pub steps: i32,
+    /// Exponential moving average of the parameters.
     pub average: Vec<f64>,
 }
 
 /// Decay of the moments, and the denominator's offset.
 #[derive(Clone, Copy, Debug)]
 pub struct Decay64 {
+    /// Decay of the first moment.
     pub beta_1: f64,
+    /// Decay of the second moment.
     pub beta_2: f64,
+    /// Offset of the denominator.
     pub epsilon: f64,
 }
 

@@ -7,7 +7,9 @@ use super::{Image64, ImageGradient64};
 /// What a view should look like.
 #[derive(Clone, Debug)]
 pub struct Target64 {
+    /// Pixels.
     pub width: usize,
+    /// Pixels.
     pub height: usize,
     /// `[H * W]` in [0, 1].
     pub color: Vec<Vector3<f64>>,
@@ -18,7 +20,9 @@ pub struct Target64 {
 /// Weights of the loss: λ of SSIM against L1, and of the depth term per metre.
 #[derive(Clone, Copy, Debug)]
 pub struct LossWeights {
+    /// λ of SSIM against L1, in [0, 1].
     pub ssim: f64,
+    /// Weight of the depth term, 1/metres.
     pub depth: f64,
     /// Depth beyond which its weight falls with the square, metres.
     pub precise_depth: f64,

@@ -17,16 +17,20 @@ use crate::splat::{GaussianCloud, ShDegree, ViewCamera};
 /// One Gaussian's raw parameters; also its gradient, which has the same shape.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Gaussian64 {
+    /// Centre in the world, metres.
     pub mean: Vector3<f64>,
+    /// Logarithm of the standard deviations, metres.
     pub log_scale: Vector3<f64>,
     /// (w, x, y, z), any length.
     pub rotation: Vector4<f64>,
+    /// Logit of the opacity.
     pub raw_opacity: f64,
     /// `[K]` RGB coefficients.
     pub sh: Vec<Vector3<f64>>,
 }
 
 impl Gaussian64 {
+    /// All parameters zero.
     pub fn zero(sh_degree: ShDegree) -> Self {
         Self {
             mean: Vector3::zeros(),
@@ -87,24 +91,31 @@ pub enum Cutoffs {
 /// A view with its background.
 #[derive(Clone, Copy, Debug)]
 pub struct View64 {
+    /// Camera and pose.
     pub camera: ViewCamera,
+    /// Linear RGB behind the map.
     pub background: Vector3<f64>,
+    /// Whether the rasterizer's discontinuities are kept.
     pub cutoffs: Cutoffs,
 }
 
 /// A rendered image, `[H * W]` each.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Image64 {
+    /// Linear RGB.
     pub color: Vec<Vector3<f64>>,
     /// Σ w z, metres.
     pub depth: Vec<f64>,
+    /// Share of the background, in [0, 1].
     pub transmittance: Vec<f64>,
 }
 
 /// Gradient of a loss by the rendered image.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ImageGradient64 {
+    /// By RGB.
     pub color: Vec<Vector3<f64>>,
+    /// By Σ w z.
     pub depth: Vec<f64>,
     /// By alpha = 1 - transmittance.
     pub alpha: Vec<f64>,
@@ -113,10 +124,14 @@ pub struct ImageGradient64 {
 /// Gradient of a loss by what the projection made of one Gaussian.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct ProjectedGradient {
+    /// By the projected centre, pixels.
     pub mean: Vector2<f64>,
     /// By the conic's xx, xy, yy; xy counts once for both of its places.
     pub conic: Vector3<f64>,
+    /// By the opacity.
     pub opacity: f64,
+    /// By RGB.
     pub color: Vector3<f64>,
+    /// By the depth along z.
     pub depth: f64,
 }

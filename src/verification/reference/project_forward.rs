@@ -8,10 +8,15 @@ use crate::splat::model;
 /// What the rasterizer needs of a Gaussian, and what the backward pass wants to see again.
 #[derive(Clone, Debug)]
 pub struct Projected64 {
+    /// Projected centre, pixels.
     pub mean: Vector2<f64>,
+    /// Along z, metres.
     pub depth: f64,
+    /// Inverse 2D covariance, 1/pixels².
     pub conic: Matrix2<f64>,
+    /// After the sigmoid, in (0, 1).
     pub opacity: f64,
+    /// RGB for the viewing direction, not below zero.
     pub color: Vector3<f64>,
     /// -log(alpha / opacity) up to which a pixel is touched.
     pub cut: f64,

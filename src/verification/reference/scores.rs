@@ -9,12 +9,17 @@ use super::{Gaussian64, ImageGradient64, View64};
 /// Scores of one Gaussian in one view.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Score64 {
+    /// Blending weight over high-error pixels.
     pub wrong_pixels: f64,
+    /// Blending weight over all pixels.
     pub weight_sum: f64,
+    /// Largest blending weight.
     pub weight_max: f64,
     /// Normalised device coordinates.
     pub gradient: f64,
+    /// Sum of the pixels' absolute gradients, normalised device coordinates.
     pub absolute_gradient: f64,
+    /// Along z, metres.
     pub depth: f64,
 }
 

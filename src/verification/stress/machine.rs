@@ -11,6 +11,7 @@ use crate::splat::GaussianCloud;
 /// A trainer of each form of the blending passes.
 #[derive(Debug)]
 pub struct Machine {
+    /// The device under test.
     pub gpu: Arc<Gpu>,
     forms: [RefCell<Trainer>; 2],
 }

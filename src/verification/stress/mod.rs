@@ -40,6 +40,7 @@ pub enum Part {
 }
 
 impl Part {
+    /// All parts, in the order in which they run.
     pub const ALL: [Self; 4] = [Self::Rasterizer, Self::Tracker, Self::Long, Self::Equivariance];
 }
 
@@ -48,6 +49,7 @@ impl Part {
 pub struct StressConfig {
     /// Cases of each family; families that take long get a share of these, and at least one.
     pub cases: usize,
+    /// Seed of the random cases.
     pub seed: u64,
     /// One part alone.
     pub only: Option<Part>,
@@ -59,16 +61,22 @@ pub struct StressConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CaseId {
+    /// The part.
     pub part: Part,
+    /// Name of the family.
     pub family: String,
+    /// Seed of the family.
     pub seed: u64,
+    /// Index of the case.
     pub index: usize,
 }
 
 /// A number that a case gave, and up to where it is right.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Measured {
+    /// Name of the quantity, with unit.
     pub quantity: &'static str,
+    /// The measured value.
     pub value: f64,
     /// Infinite where the number is only reported.
     pub limit: f64,
@@ -77,6 +85,7 @@ pub struct Measured {
 /// What came of a case.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Outcome {
+    /// Quantities with their limits.
     pub measured: Vec<Measured>,
     /// Things counted, summed up over a family.
     pub counts: Vec<(&'static str, u64)>,

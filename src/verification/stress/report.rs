@@ -13,12 +13,17 @@ const KEPT_FAILURES: usize = 10;
 /// One number over all cases of a family.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Row {
+    /// Name of the quantity, with unit.
     pub quantity: &'static str,
     /// Cases that gave this number, and those that were above its limit.
     pub cases: usize,
+    /// Cases above the limit.
     pub failures: usize,
+    /// Median over the cases.
     pub median: f64,
+    /// 95th percentile over the cases.
     pub percentile_95: f64,
+    /// Maximum over the cases.
     pub worst: f64,
     /// `None` where the number is only reported.
     pub limit: Option<f64>,
@@ -29,27 +34,37 @@ pub struct Row {
 /// A case that failed, and why.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Failure {
+    /// The failed case.
     pub case: CaseId,
+    /// Reasons of the failure.
     pub what: Vec<String>,
 }
 
 /// What came of one family.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct FamilyReport {
+    /// The part.
     pub part: Part,
+    /// Name of the family.
     pub name: String,
+    /// Seed of the family.
     pub seed: u64,
+    /// Cases run.
     pub cases: usize,
     /// Cases with anything wrong.
     pub failed: usize,
+    /// Quantities measured.
     pub rows: Vec<Row>,
+    /// Sums of what the cases counted.
     pub counts: BTreeMap<&'static str, u64>,
+    /// First failures, in words.
     pub failures: Vec<Failure>,
 }
 
 /// What came of all.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct StressReport {
+    /// All families that ran.
     pub families: Vec<FamilyReport>,
 }
 
@@ -113,10 +128,12 @@ impl Row {
 }
 
 impl StressReport {
+    /// Cases of all families.
     pub fn cases(&self) -> usize {
         self.families.iter().map(|family| family.cases).sum()
     }
 
+    /// Failed cases of all families.
     pub fn failed(&self) -> usize {
         self.families.iter().map(|family| family.failed).sum()
     }

@@ -1,4 +1,4 @@
-//! Benchmarks that run anywhere: the training step, stage by stage, beside the floor that the adapter's own
+//! Calibration on the adapter at hand: times of the training step, stage by stage, beside the floor that the adapter's own
 //! bandwidth and arithmetic set for the work really done.
 
 mod rates;
