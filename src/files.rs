@@ -32,7 +32,7 @@ pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), WriteError> {
     write(path, bytes, |_| Ok(()))
 }
 
-/// The same, flushed to the disk itself: after a power cut either the new file or the old one is there.
+/// Writes as [`write_atomically`] and flushes to the disk: after a power cut either the new file or the old one is there.
 ///
 /// # Errors
 /// As [`write_atomically`].

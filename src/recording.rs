@@ -96,7 +96,7 @@ impl Recording {
         Ok(recording)
     }
 
-    /// The same frames mapped at `map_scale`, a share of the recorded resolution.
+    /// The recording mapped at `map_scale`, a share of the recorded resolution.
     ///
     /// # Errors
     /// If the scale is not above 0 and at most 1, or images become too small to be compared.

@@ -7,7 +7,7 @@ use serde::Serialize;
 use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, workgroups};
 use crate::render::{BlendForm, shaders};
 
-/// What the adapter reaches on the simplest kernels.
+/// Bandwidth and arithmetic rate of the adapter, measured with the simplest kernels.
 #[derive(Clone, Copy, Debug, Serialize)]
 pub struct Rates {
     /// Bytes read plus bytes written per second, copying vec4.

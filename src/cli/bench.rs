@@ -34,7 +34,7 @@ enum What {
     Ablation(ablation::AblationArgs),
     /// Whole runs over sequences, numbers of steps and seeds: what time buys, as table and curves.
     Sweep(sweep::SweepArgs),
-    /// What got better or worse from one sweep to another.
+    /// Changes between two sweeps.
     Compare(sweep::CompareArgs),
 }
 

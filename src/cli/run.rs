@@ -73,7 +73,7 @@ pub struct RunArgs {
     set: Vec<String>,
 }
 
-/// The same file, named from the root.
+/// The file's absolute path.
 fn absolute(path: &str) -> miette::Result<String> {
     Ok(std::path::absolute(path).into_diagnostic()?.to_string_lossy().into_owned())
 }

@@ -13,7 +13,7 @@ pub struct Exposures(Vec<ExposureRecord>);
 pub struct ExposureRecord {
     /// Seconds, by the clock of the recording.
     pub timestamp_s: f64,
-    /// Of red, green and blue: natural logarithm of what the picture's colour is to the map's.
+    /// Natural logarithm of image over map, for red, green and blue.
     pub log_gain: Exposure,
 }
 
@@ -21,7 +21,7 @@ pub struct ExposureRecord {
 const MAX_LOG_GAIN: f32 = 5.0;
 
 impl Exposures {
-    /// Of moments in any order.
+    /// Exposures from records in any order.
     pub fn new(mut records: Vec<ExposureRecord>) -> Self {
         records.sort_by(|a, b| a.timestamp_s.total_cmp(&b.timestamp_s));
         Self(records)

@@ -209,8 +209,7 @@ impl ImageMeans {
 }
 
 impl Times {
-    /// Of times in milliseconds in any order; `None` for no times. The 95th percentile is the smallest time that at least 95 %
-    /// do not exceed; the median of an even number is the mean of the middle two.
+    /// Statistics of times in any order, milliseconds; `None` without times. `p95` is the smallest time that 95 % do not exceed.
     pub fn of(times_ms: &[f64]) -> Option<Self> {
         let mut sorted = times_ms.to_vec();
         sorted.sort_by(f64::total_cmp);

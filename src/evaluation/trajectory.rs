@@ -16,7 +16,7 @@ pub const MAX_TIME_DIFFERENCE_S: f64 = 0.02;
 /// Fewer pairs always fit, so their error says nothing.
 const MIN_PAIRS: usize = 3;
 
-/// What the estimate may be moved by before it is compared.
+/// Transformation that aligns the estimate before it is compared.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Alignment {
     /// SE(3): RGB-D and stereo, which know their scale.

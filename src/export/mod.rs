@@ -17,7 +17,7 @@ use crate::splat::GaussianCloud;
 /// All formats; the first one is the default.
 static FORMATS: [MapFormat; 1] = [MapFormat(&ply::FORMAT)];
 
-/// What a format's file provides.
+/// A map format: encoder and decoder.
 struct FormatRow {
     /// Name on the command line and in configurations.
     name: &'static str,

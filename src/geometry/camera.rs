@@ -44,7 +44,7 @@ impl Pinhole {
             && pixel.y <= f64::from(self.height) - 1.0 - margin
     }
 
-    /// The same camera for images resized to `scale` times their size (rounded), with pixel centres kept where they belong.
+    /// The camera of images resized to `scale` times their size (rounded), with pixel centres kept where they belong.
     pub fn scaled(&self, scale: f64) -> Self {
         let width = (f64::from(self.width) * scale).round().max(1.0);
         let height = (f64::from(self.height) * scale).round().max(1.0);

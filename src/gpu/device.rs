@@ -68,7 +68,7 @@ pub enum GpuError {
     Failed(String),
 }
 
-/// What identifies an adapter in metrics and lists.
+/// Identity of an adapter in metrics and lists.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct AdapterSummary {
     /// Name of the adapter.
@@ -171,7 +171,7 @@ impl Gpu {
         Self::open_with(wanted, wgpu::Features::empty(), u64::MAX)
     }
 
-    /// The same, with timestamps where the adapter has them (see [`Self::take_profile`]).
+    /// Opens a device with timestamps where the adapter has them (see [`Self::take_profile`]).
     ///
     /// # Errors
     /// [`GpuError`] if no such adapter exists or it gives no device.
@@ -179,7 +179,7 @@ impl Gpu {
         Self::open_with(wanted, Profiler::FEATURES, u64::MAX)
     }
 
-    /// The same as [`Self::open`], on an adapter made smaller: no buffer may be larger than `bytes`.
+    /// Opens as [`Self::open`] with a smaller limit: no buffer may be larger than `bytes`.
     ///
     /// # Errors
     /// [`GpuError`] if no such adapter exists or it gives no device.

@@ -190,7 +190,7 @@ impl Default for InsertionConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct PointsConfig {
-    /// Of points nearer to one another than about so many pixels of the nearest view (at the mapping resolution), one is taken.
+    /// Least spacing of the points, about so many pixels of the nearest view (at the mapping resolution).
     pub spacing_pixels: f32,
     /// Standard deviation in units of the mean distance to the three nearest points.
     pub footprint: f32,
@@ -220,7 +220,7 @@ pub struct RefineConfig {
     pub growth_share: f32,
     /// Share of the steps, the first ones, that see the images at half size.
     pub half_size_share: f32,
-    /// What the rates of positions, and all others, fall to in the end, as a share of what they are at first.
+    /// Final learning rates as a share of the initial ones: positions, then all others.
     pub final_lr_scale_position: f32,
     /// Factor on all other learning rates at the end of the refinement.
     pub final_lr_scale: f32,
@@ -253,7 +253,7 @@ impl MappingConfig {
         Self { iterations_per_keyframe: 0, first_iterations: 0, refine, adam, density, ..Self::default() }
     }
 
-    /// The same for a world whose unit is not the metre but `units_per_metre` to one: each length is given in that unit.
+    /// A copy for a world of `units_per_metre` units to a metre: every length is converted.
     pub fn in_units(&self, units_per_metre: f32) -> Self {
         let mut scaled = self.clone();
         let lengths = [

@@ -15,7 +15,7 @@ use crate::render::Plan;
 const MIN_SHIFT_METRES: f64 = 0.01;
 const MIN_TURN_RAD: f64 = 0.5 * std::f64::consts::PI / 180.0;
 
-/// Of one Gaussian.
+/// Statistics of one Gaussian.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub(super) struct GaussianHistory {
     /// It moves with this keyframe.
@@ -30,7 +30,7 @@ pub(super) struct GaussianHistory {
     pub contribution: f32,
 }
 
-/// The histories, `[N]` in map order. Seeds are appended and pruning keeps the order, so most of a keyframe's Gaussians lie side by side.
+/// The histories, `[N]` in map order. Inserted Gaussians are appended and pruning keeps the order, so most of a keyframe's Gaussians lie side by side.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub(super) struct GaussianStats {
     histories: Vec<GaussianHistory>,

@@ -128,7 +128,7 @@ struct Sums<const N: usize> {
 }
 
 impl<const N: usize> Sums<N> {
-    /// Of values that come row by row.
+    /// Sums of values in row-major order.
     fn new((width, height): (u32, u32), values: impl Iterator<Item = [f64; N]>) -> Self {
         let row = width as usize + 1;
         let mut sums = vec![[0.0; N]; row * (height as usize + 1)];
@@ -189,7 +189,7 @@ impl ColorSums {
     }
 }
 
-/// What the render misses: the brightness of image minus render.
+/// Brightness residual, image minus render.
 struct Missed(Sums<1>);
 
 impl Missed {

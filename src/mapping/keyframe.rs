@@ -15,7 +15,7 @@ use crate::optimise::{TargetImage, TrainingView};
 use crate::sequence::{DepthImage, RectifiedImage};
 use crate::splat::{Exposure, ViewCamera};
 
-/// What arrives.
+/// A keyframe from the tracker.
 #[derive(Clone, Debug)]
 pub struct Keyframe {
     /// Identity, ascending in the order of tracking.
@@ -59,7 +59,7 @@ pub struct RightImage {
     pub baseline_metres: f64,
 }
 
-/// What is kept: the image only where the optimiser needs it.
+/// A keyframe in the mapper; its image is kept only while the optimiser needs it.
 #[derive(Debug)]
 pub(super) struct MappedKeyframe {
     /// Identity, ascending in the order of tracking.
@@ -69,7 +69,7 @@ pub(super) struct MappedKeyframe {
     /// The tracker's camera_from_world, which the refinement goes out from.
     pub tracked_from_world: Se3,
     pub refinement: PoseRefinement,
-    /// Of the recorded image against the map; the image that is kept is corrected.
+    /// Exposure of the recorded image against the map; the kept image is corrected by it.
     pub exposure: Exposure,
     /// Median of the measured depths, metres; 1 if there are none.
     pub depth_metres: f64,
@@ -86,7 +86,7 @@ pub(super) struct MappedKeyframe {
 #[derive(Debug)]
 struct Images {
     whole: TargetImage,
-    /// The same at half the size, where it is wanted.
+    /// Target at half the size, where coarse steps use it.
     half: Option<TargetImage>,
 }
 
@@ -245,7 +245,7 @@ impl MappedKeyframe {
         self.gray.is_some()
     }
 
-    /// What depth is swept for with.
+    /// View of the plane sweep.
     pub fn source(&self) -> Option<SourceView<'_>> {
         self.gray.as_ref().map(|gray| SourceView { camera: self.camera, gray })
     }
@@ -256,7 +256,7 @@ impl MappedKeyframe {
         self.image.as_ref().map_or(0, |image| if image.half.is_some() { pixels * 10 } else { pixels * 8 })
     }
 
-    /// What a step learns from; coarse where that is wished and there is a smaller image. `None` without an image.
+    /// Training view; the smaller image if `coarse` and there is one. `None` without an image.
     pub fn view(&self, coarse: bool) -> Option<TrainingView<'_>> {
         let image = self.image.as_ref()?;
         Some(match image.half.as_ref().filter(|_| coarse) {
@@ -272,7 +272,7 @@ impl MappedKeyframe {
 /// Shorter sides below this many pixels are not halved.
 const MIN_HALVED: u32 = 64;
 
-/// Of an image whose odd last row or column is left out.
+/// Pinhole of the half-size image; an odd last row or column is left out.
 fn halved_pinhole(p: &Pinhole) -> Pinhole {
     let half = |c: f64| (c + 0.5) * 0.5 - 0.5;
     Pinhole { fx: 0.5 * p.fx, fy: 0.5 * p.fy, cx: half(p.cx), cy: half(p.cy), width: p.width / 2, height: p.height / 2 }

@@ -18,7 +18,7 @@ const LEAST_KEYFRAMES: usize = 8;
 /// New Gaussians of one keyframe may take at most this share of all places.
 const INSERTED_SHARE: f64 = 0.5;
 
-/// What the mapper may use.
+/// Resource limits of the mapper.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct LimitsConfig {

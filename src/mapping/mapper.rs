@@ -63,7 +63,7 @@ pub enum MappingError {
     State,
 }
 
-/// What happened to a keyframe.
+/// Result of mapping a keyframe.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct KeyframeReport {
     /// The keyframe.
@@ -85,10 +85,10 @@ pub struct KeyframeReport {
     pub exposure: Exposure,
 }
 
-/// Seeds, optimises and prunes the map.
+/// Inserts, optimises and prunes Gaussians.
 #[derive(Debug)]
 pub struct Mapper {
-    /// As resolved; no phase changes it.
+    /// Resolved configuration, immutable.
     config: Arc<MappingConfig>,
     gpu: Arc<Gpu>,
     trainer: Trainer,
@@ -132,7 +132,7 @@ impl Mapper {
         if exposure != Exposure::default() {
             keyframe.to_mut().image.color = exposure::corrected(&keyframe.image.color, &exposure);
         }
-        // Before its seeds: a bound on memory leaves to it what the image has left.
+        // Before its insertion: a bound on memory leaves to it what the image has left.
         let mapped = MappedKeyframe::new(&self.gpu, &keyframe, exposure, self.config.learns_at_half_size())?;
         self.keyframes.push(mapped);
         self.limit_keyframes();
@@ -185,7 +185,7 @@ impl Mapper {
         Ok(moved.iter().map(|(run, _)| run.len()).sum())
     }
 
-    /// What the images say of the window's poses, for the tracker; nothing unless poses are refined.
+    /// Refined relative poses of the window, for the tracker; empty unless poses are refined.
     pub fn refined(&self) -> Vec<RefinedPair> {
         if !self.config.refine_poses.enabled || self.keyframes.is_empty() {
             return Vec::new();

@@ -30,7 +30,7 @@ pub struct PlaneSweepConfig {
     pub uniqueness: f32,
     /// Least share of landmarks that the depth must agree with; below it all depth is dropped.
     pub min_agreement: f64,
-    /// What such depth, and that of landmarks alone, counts in the loss: as a share of measured depth (`mapping.loss.depth_weight`).
+    /// Weight of estimated depth in the loss, as a share of that of measured depth (`mapping.loss.depth_weight`).
     pub depth_confidence: f32,
 }
 
@@ -173,7 +173,7 @@ impl Source {
 const CENSUS_BITS: u8 = 24;
 const CENSUS_REACH: i32 = 2;
 
-/// Of each pixel, which of the 5×5 around it are darker.
+/// Census transform over 5×5 pixels: one bit for each darker neighbour.
 fn census(gray: &GrayImage) -> Vec<u32> {
     let (width, height) = (gray.width() as i32, gray.height() as i32);
     let at = |x: i32, y: i32| gray.as_raw()[(y.clamp(0, height - 1) * width + x.clamp(0, width - 1)) as usize];
@@ -216,7 +216,7 @@ fn matching_costs(view: &SourceView<'_>, others: &[Source], inverse_depths: &[f3
     costs
 }
 
-/// Of each pixel the best plane, to a fraction; none where another one is nearly as good.
+/// Best plane of each pixel, interpolated; none where another one is nearly as good.
 fn best_planes(sums: &[u16], config: &PlaneSweepConfig) -> Vec<Option<f32>> {
     let best = |sums: &[u16]| {
         let (k, least) = (0..).zip(sums).min_by_key(|(_, sum)| **sum)?;

@@ -134,7 +134,7 @@ impl PoseRefinement {
     }
 }
 
-/// What the images say of two keyframes, in the terms of the tracker.
+/// Relative pose of two keyframes, refined by their images.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RefinedPair {
     /// The keyframe that is measured.

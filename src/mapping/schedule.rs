@@ -45,7 +45,7 @@ struct Gain {
     after: f32,
 }
 
-/// What one step learns from.
+/// Training view of a step.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Step {
     pub keyframe: usize,

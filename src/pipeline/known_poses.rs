@@ -18,7 +18,7 @@ use crate::run_folder::FrameRecord;
 use crate::sequence::{Frame, KnownPoint, Rectifier, Sensor};
 use crate::tracking::{KeyframePose, StageTimes};
 
-/// What the mapper's lengths are made for: the median distance, in metres, at which a camera sees things in a room.
+/// Median depth for which the mapper's lengths are chosen, metres: that of a room.
 const USUAL_DISTANCE_METRES: f64 = 2.0;
 /// Cameras and points that are looked at for the scene's own distance: enough for a median.
 const SAMPLED_CAMERAS: usize = 50;

@@ -58,7 +58,7 @@ pub(super) struct MapThread<'a> {
 struct Start {
     mapper: Mapper,
     cloud: Arc<GaussianCloud>,
-    /// Of a resumed run whose final refinement had begun.
+    /// State of a final refinement that a resumed run had begun.
     refinement: Option<FinalRefinement>,
     records: Vec<KeyframeRecord>,
 }

@@ -27,7 +27,7 @@ const MESSAGES_AHEAD: usize = 4;
 pub struct Replay {
     /// Trajectory, map and records until the end.
     pub result: RunResult,
-    /// What ended it early.
+    /// Error that ended the run early.
     pub error: Option<PipelineError>,
     /// Whether [`Progress::stop`] ended it early.
     pub stopped: bool,

@@ -28,7 +28,7 @@ pub struct GpuCloud {
     parameters: GpuBuffer,
     moments_1: GpuBuffer,
     moments_2: GpuBuffer,
-    /// What the parameters were over each Gaussian's last steps, on average.
+    /// Exponential moving average of the parameters.
     averages: GpuBuffer,
     /// As large as the others: a change gathers one of them into it, the next into that one, and so on, so that it needs no memory.
     spare: Option<GpuBuffer>,

@@ -275,7 +275,7 @@ impl Rasterizer {
         Ok(counts)
     }
 
-    /// What the counters of a view say; `None` where its intersections did not fit.
+    /// Counts of a view; `None` where its intersections did not fit.
     pub fn counts(&self, counters: &[Counter]) -> Option<ViewCounts> {
         let intersections = counters[INTERSECTION_COUNTER as usize];
         let fits = intersections.count == intersections.needed;

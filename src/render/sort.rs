@@ -10,12 +10,12 @@ const NO_COUNTER: u32 = u32::MAX;
 const DIGIT_BITS: u32 = 8;
 
 impl ScanSetup {
-    /// Of `count` elements; the total goes to `counter_out`, if it fits `capacity`.
+    /// Scans `count` elements; the total goes to `counter_out`, if it fits `capacity`.
     pub(super) fn known(count: u32, counter_out: u32, capacity: u32) -> Self {
         Self { count, counter_in: NO_COUNTER, counter_out, capacity }
     }
 
-    /// Of as many elements as `counter_in` counts.
+    /// Scans as many elements as `counter_in` counts.
     pub(super) fn counted(counter_in: u32, counter_out: u32, capacity: u32) -> Self {
         Self { count: 0, counter_in, counter_out, capacity }
     }
@@ -26,7 +26,7 @@ pub(super) struct ScanJob<'a> {
     pub setup: &'a GpuBuffer,
     pub values: &'a GpuBuffer,
     pub prefix: &'a GpuBuffer,
-    /// What the length cannot exceed.
+    /// Upper bound of the length.
     pub bound: u32,
 }
 
@@ -73,7 +73,7 @@ pub(super) struct Sort {
     count_digits: Kernel,
     scan_digits: Kernel,
     scatter: Kernel,
-    /// Of each counter, by digit.
+    /// Setups of each counter, by digit.
     setups: Vec<Vec<GpuBuffer>>,
 }
 

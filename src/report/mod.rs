@@ -43,7 +43,7 @@ pub enum ReportError {
     Write(#[from] WriteError),
 }
 
-/// What a folder holds of a run.
+/// Files of a run that the report shows.
 struct Run {
     folder: PathBuf,
     metrics: Metrics,

@@ -16,7 +16,7 @@ const SQUARE: (u32, u32) = (560, 440);
 const TRUTH: RGBColor = RGBColor(140, 140, 140);
 const LINE: RGBColor = RGBColor(46, 120, 210);
 const SECOND: RGBColor = RGBColor(214, 110, 40);
-/// Of the tracker's stages, in their order.
+/// Names and colours of the tracker's stages, in their order.
 pub const STAGES: [(&str, RGBColor); 5] = [
     ("features", RGBColor(46, 120, 210)),
     ("localise", RGBColor(214, 110, 40)),

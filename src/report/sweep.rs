@@ -85,7 +85,7 @@ pub struct Point {
     pub gaussians: Option<Spread>,
 }
 
-/// What is compared over time, and which way is better.
+/// Figure that is compared between sweeps.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Figure {
     /// Time of a run; lower is better.
@@ -189,7 +189,7 @@ impl Figure {
         if self == Self::Psnr { -value } else { value }
     }
 
-    /// What a difference must exceed to count, beside the spread: few runs do not show all of it.
+    /// Least difference that counts, beside the spread: few runs do not show all of it.
     fn tolerance(self, value: f64) -> f64 {
         match self {
             Self::Time => 0.1 * value,
@@ -238,7 +238,7 @@ pub fn pareto(points: &[(f64, f64)]) -> Vec<bool> {
     points.iter().map(|p| !points.iter().any(|other| beats(other, p))).collect()
 }
 
-/// What both sweeps measured, and how it changed.
+/// Changes of the figures that both sweeps measured.
 pub fn compare(before: &[SweepRow], after: &[SweepRow]) -> Vec<Change> {
     let before = points(before);
     let mut changes = Vec::new();

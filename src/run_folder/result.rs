@@ -16,7 +16,7 @@ pub struct RunResult {
     pub cloud: Arc<GaussianCloud>,
     /// Frame index and `world_from_camera` of every tracked frame.
     pub poses: Vec<(usize, StampedPose)>,
-    /// The same poses without frame indices.
+    /// Poses without frame indices.
     pub trajectory: Trajectory,
     /// All keyframes, in order of creation.
     pub keyframes: Vec<KeyframePose>,

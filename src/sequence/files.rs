@@ -29,7 +29,7 @@ pub fn images_in(folder: &Path) -> Result<Vec<PathBuf>, SequenceError> {
     files_in(folder, &["png", "jpg", "jpeg"])
 }
 
-/// What a folder holds with one of these extensions (lower case), by name.
+/// Files of a folder with one of these extensions (lower case), by name.
 pub fn files_in(folder: &Path, extensions: &[&str]) -> Result<Vec<PathBuf>, SequenceError> {
     let wanted = |path: &PathBuf| {
         let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());

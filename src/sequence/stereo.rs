@@ -18,7 +18,7 @@ const MARGIN: f64 = 0.1;
 /// A rectified pair, and where it came from.
 #[derive(Debug)]
 pub struct StereoRectification {
-    /// Of both cameras, at the recorded size.
+    /// Pinhole of both rectified cameras, at the recorded size.
     pub pinhole: Pinhole,
     pub baseline_metres: f64,
     pub rectified_from_left: UnitQuaternion<f64>,

@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use super::SceneError;
 
-/// What to render. Two scenes that are equal give the same recording to the byte.
+/// Description of a synthetic recording. Equal descriptions give byte-identical recordings.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SceneConfig {
@@ -164,7 +164,7 @@ impl Default for PathConfig {
     }
 }
 
-/// What goes wrong on the way to the file. Everything is off by default.
+/// Faults of the sensor; all off by default.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DegradationConfig {

@@ -33,7 +33,7 @@ impl Piece {
         self.turned_block(foot, size, 0.0, material);
     }
 
-    /// The same, turned about the vertical.
+    /// A copy turned about the vertical.
     fn turned_block(&mut self, foot: DVec3, size: DVec3, yaw_rad: f64, material: Material) {
         let centre = foot + DVec3::Z * size.z * 0.5;
         self.add(Shape::Block { half: size * 0.5 }, centre, DMat3::from_rotation_z(yaw_rad), material);

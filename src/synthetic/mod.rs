@@ -144,7 +144,7 @@ impl SceneConfig {
         Self::parse(&text, path)
     }
 
-    /// The same of a text; `path` is named in errors.
+    /// Parses and checks a scene; `path` is named in errors.
     ///
     /// # Errors
     /// As [`Self::read`], except for reading.

@@ -25,7 +25,7 @@ const TILE: usize = 8;
 /// Sharpness of highlights on glossy things.
 const SHININESS: f32 = 50.0;
 
-/// What the pixel-centre ray of a pixel meets.
+/// Surface hit by a pixel's central ray.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Geometry {
     /// Along z, metres.

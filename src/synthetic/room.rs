@@ -16,7 +16,7 @@ const FURNITURE_CLEARANCE: f64 = 0.55;
 pub const MIN_CLEARANCE: f64 = 0.4;
 /// Places tried for a piece before the room counts as full.
 const TRIES: usize = 1500;
-/// Of the places that fit, so many are compared for how much of the piece the camera sees.
+/// Candidate places of a piece, compared by the share of it that the camera sees.
 const CHOICES: usize = 14;
 /// Gap between two pieces, metres.
 const GAP: f64 = 0.04;

@@ -43,7 +43,7 @@ pub enum TrackingState {
 pub struct TrackedFrame {
     /// Whether the frame has a pose.
     pub state: TrackingState,
-    /// As of now; later keyframe corrections move it (see [`Tracker::trajectory`]). `None` when lost.
+    /// Current estimate; later keyframe corrections move it (see [`Tracker::trajectory`]). `None` when lost.
     pub world_from_camera: Option<Se3>,
     /// Landmarks that agree with the pose.
     pub inliers: usize,

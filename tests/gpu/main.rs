@@ -14,5 +14,5 @@ mod reference_gradients;
 mod refined_poses;
 mod scores;
 mod shaders;
-mod skipped_tiles;
 mod stress;
+mod tile_sampling;

@@ -22,7 +22,7 @@ const SCENES: [(&str, &str); 3] = [
     ("room-clean", include_str!("../../../sequences/room-clean.toml")),
     ("room-noisy", include_str!("../../../sequences/room-noisy.toml")),
 ];
-/// What made a run, in its folder: a run of the same is not made again.
+/// Origin of a run, in its folder: an identical run is not repeated.
 const MADE_BY: &str = "made-by.json";
 /// Default, without numbers of steps or presets.
 const USUAL_STEPS: [usize; 4] = [12, 25, 50, 100];

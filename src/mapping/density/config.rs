@@ -13,7 +13,7 @@ pub enum DensityStrategy {
     MultiView,
     /// By the gradient alone (3DGS, Kerbl et al. 2023).
     Classic,
-    /// Seeds only.
+    /// Insertion only.
     None,
 }
 
@@ -62,7 +62,7 @@ pub struct MultiViewConfig {
     pub min_weight: f32,
     /// One that never adds more than this to a view is removed too: pixels.
     pub min_contribution: f32,
-    /// Of the Gaussians below this opacity, the half with more wrong pixels is removed.
+    /// Opacity below which the half of the Gaussians with more high-error pixels is pruned.
     pub faint_opacity: f32,
 }
 
@@ -115,13 +115,13 @@ impl Default for ClassicConfig {
 }
 
 impl DensityConfig {
-    /// What counts as a wrong pixel when the Gaussians are scored.
+    /// High-error mask of the Gaussian scores.
     pub fn wrong_pixels(&self) -> WrongPixels {
         let MultiViewConfig { error_ratio, noise, .. } = self.multi_view;
         WrongPixels { error_ratio, noise }
     }
 
-    /// The same, but nothing is divided any more.
+    /// A copy without densification.
     pub fn without_growth(&self) -> Self {
         let mut still = self.clone();
         (still.multi_view.max_growth, still.classic.gradient) = (0.0, f32::MAX);

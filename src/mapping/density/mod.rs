@@ -14,7 +14,7 @@ use crate::splat::{opacity_from_raw, raw_opacity_from_opacity};
 
 mod config;
 
-/// What a strategy sees of a Gaussian.
+/// Input of a density strategy: one Gaussian.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Candidate {
     pub geometry: GaussianGeometry,
@@ -22,7 +22,7 @@ pub(super) struct Candidate {
     pub history: GaussianHistory,
 }
 
-/// What a strategy says of one Gaussian.
+/// Decision of a density strategy for one Gaussian.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Verdict {
     Keep,

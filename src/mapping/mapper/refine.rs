@@ -21,7 +21,7 @@ pub struct FinalRefinement {
     rounds: usize,
 }
 
-/// What a round of refinement did.
+/// Result of a refinement round.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct RefineReport {
     /// Steps since the beginning of the refinement.

@@ -34,19 +34,19 @@ pub struct Adjustment {
 }
 
 impl Adjustment {
-    /// Of the window around `keyframe`; `None` if nothing in it may move.
+    /// Local bundle adjustment around `keyframe`; `None` if nothing in its window may move.
     pub fn of_window(map: &Map, keyframe: usize, config: &TrackingConfig) -> Option<Self> {
         let (free, fixed) = choose_window(map, keyframe, config);
         Self::new(map, &free, &fixed, config)
     }
 
-    /// Of all keyframes; `None` if they are too many.
+    /// Global bundle adjustment; `None` with too many keyframes.
     pub fn of_all(map: &Map, config: &TrackingConfig) -> Option<Self> {
         let all: Vec<usize> = (1..map.keyframes.len()).filter(|k| !map.culled.contains_key(k)).collect();
         if all.len() > MAX_ADJUSTED { None } else { Self::new(map, &all, &[0], config) }
     }
 
-    /// Of the keyframes `free` and all their landmarks, held in place by `fixed`.
+    /// Bundle adjustment of the keyframes `free` and all their landmarks, with `fixed` held constant.
     fn new(map: &Map, free: &[usize], fixed: &[usize], config: &TrackingConfig) -> Option<Self> {
         if free.is_empty() || config.bundle_iterations == 0 {
             return None;

@@ -156,7 +156,7 @@ impl FrontEnd {
 }
 
 impl Feature {
-    /// As a measurement with its noise.
+    /// Measurement with weights from the noise model.
     pub fn measurement(&self, config: &TrackingConfig) -> Measurement {
         Measurement {
             pixel: self.pixel,

@@ -19,7 +19,7 @@ const ROTATION_BIN_SHARE: f64 = 0.1;
 /// How far (1/metres) a measured inverse depth may be from the predicted one; wide, only to tell surfaces apart.
 const INVERSE_DEPTH_GATE: f64 = 0.15;
 
-/// What is looked for around a pixel.
+/// Descriptor to be matched around a pixel.
 #[derive(Clone, Debug)]
 pub struct Query {
     pub pixel: Vector2<f64>,

@@ -67,7 +67,7 @@ pub fn two_views(matches: &[(Vector2<f64>, Vector2<f64>)], pinhole: &Pinhole) ->
     (enough && clear && parallax_rad * pinhole.fx >= MIN_PARALLAX_PIXELS).then_some(best)
 }
 
-/// What one model of the two views allows.
+/// Candidate motions of one two-view model.
 struct Candidates {
     motions: Vec<Se3>,
     inliers: Vec<bool>,

@@ -34,7 +34,7 @@ const ROUGH_FACTOR: f64 = 2.5;
 const MAP_RULES: Rules = Rules { max_distance: 80, ratio: 0.8, check_rotation: false };
 /// The local map: keyframes that see the frame's landmarks, and what these share most with.
 const LOCAL_KEYFRAMES: usize = 20;
-const LOCAL_SEEDS: usize = 5;
+const LOCAL_NEAREST: usize = 5;
 const LOCAL_NEIGHBOURS: usize = 5;
 /// Keyframes tried when lost.
 const RELOCALISATION_KEYFRAMES: usize = 4;
@@ -70,7 +70,7 @@ pub struct View {
     landmarks: Vec<Option<usize>>,
 }
 
-/// What the searches need.
+/// Localisation in a map.
 pub struct Context<'a> {
     pub map: &'a mut Map,
     pub rig: &'a Rig,
@@ -248,13 +248,13 @@ impl Context<'_> {
     }
 
     fn local_landmarks(&self, start: &Localised, reference: usize) -> Vec<usize> {
-        let seeds = self.map.covisibility(start.landmarks.iter().flatten().copied());
-        let mut keyframes: Vec<usize> = seeds.iter().take(LOCAL_KEYFRAMES).map(|(k, _)| *k).collect();
+        let observing = self.map.covisibility(start.landmarks.iter().flatten().copied());
+        let mut keyframes: Vec<usize> = observing.iter().take(LOCAL_KEYFRAMES).map(|(k, _)| *k).collect();
         if !keyframes.contains(&reference) {
             keyframes.push(reference);
         }
-        for (seed, _) in seeds.iter().take(LOCAL_SEEDS) {
-            for (neighbour, _) in self.map.covisible(*seed).into_iter().take(LOCAL_NEIGHBOURS) {
+        for (keyframe, _) in observing.iter().take(LOCAL_NEAREST) {
+            for (neighbour, _) in self.map.covisible(*keyframe).into_iter().take(LOCAL_NEIGHBOURS) {
                 if !keyframes.contains(&neighbour) {
                     keyframes.push(neighbour);
                 }

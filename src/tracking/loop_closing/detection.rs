@@ -31,11 +31,11 @@ const PROJECTION_SEARCH: ProjectionSearch =
 /// Landmarks of the place that the keyframe must show, in number and as a share of what it should show.
 const MIN_INLIERS: usize = 40;
 const MIN_FOUND_SHARE: f64 = 0.15;
-/// The same of the keyframe's neighbours, and how many of how many must agree.
+/// Least inliers in a neighbour of the keyframe, and how many of how many neighbours must agree.
 const MIN_NEIGHBOUR_INLIERS: usize = 25;
 const NEIGHBOURS_ASKED: usize = 4;
 const NEIGHBOURS_AGREEING: usize = 2;
-/// What drift can explain: metres for each metre of the way since, radians for each radian turned, and some of each to begin with; the
+/// Largest plausible drift: metres a metre of path, radians a radian of rotation, and constant parts; the
 /// scale within this factor.
 const MAX_DRIFT_SHARE: f64 = 0.15;
 const DRIFT_METRES: f64 = 0.1;
@@ -61,7 +61,7 @@ pub fn knows_scale(map: &Map) -> bool {
     map.keyframes.first().is_some_and(|k| k.features.features.iter().any(|f| f.depth_metres.is_some()))
 }
 
-/// What recognition needs.
+/// Loop detection in a map.
 pub struct Search<'a> {
     pub map: &'a Map,
     pub rig: &'a Rig,
@@ -182,7 +182,7 @@ impl Search<'_> {
     }
 }
 
-/// What a keyframe shows of some landmarks.
+/// Landmarks found in a keyframe.
 struct Seen {
     camera_from_world: Se3,
     /// Landmark and feature.

@@ -68,7 +68,7 @@ pub struct Keyframe {
     pub landmarks: Vec<Option<usize>>,
 }
 
-/// What is left of a culled keyframe: it goes rigidly with a living one.
+/// A culled keyframe, rigidly attached to its parent.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CulledKeyframe {
     /// A keyframe that has not been culled.

@@ -34,7 +34,7 @@ pub struct RelativePose {
     pub believed: bool,
 }
 
-/// What is to be solved.
+/// Bundle adjustment problem.
 #[derive(Clone, Debug, Default)]
 pub struct BundleProblem {
     /// camera_from_world.
@@ -61,9 +61,9 @@ struct System {
     gradient_poses: Vec<Vector6<f64>>,
     hessian_points: Vec<Matrix3<f64>>,
     gradient_points: Vec<Vector3<f64>>,
-    /// Of free poses only, sorted by point.
+    /// Blocks of free poses, sorted by point.
     mixed: Vec<Mixed>,
-    /// Of two free poses that a measurement ties: row, column (the lower), block.
+    /// Blocks of two free poses with a relative pose factor: row, column (the lower), block.
     ties: Vec<(usize, usize, Matrix6<f64>)>,
 }
 
@@ -184,7 +184,7 @@ impl BundleProblem {
         }
     }
 
-    /// What the poses' equations look like, whatever the numbers; `None` if they are too many.
+    /// Sparsity of the reduced camera system; `None` if it has too many blocks.
     fn reduced_system(&self) -> Option<ReducedSystem> {
         let is_free = |pose: &usize| *pose < self.free_poses;
         let seen = self.observations.chunk_by(|a, b| a.point == b.point).flat_map(|group| {

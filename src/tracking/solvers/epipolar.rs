@@ -21,7 +21,7 @@ pub fn fundamental(second_from_first: &Se3, pinhole: &Pinhole) -> Matrix3<f64> {
     fundamental_of(&(skew(&second_from_first.translation.vector) * rotation), pinhole)
 }
 
-/// The same of an essential matrix.
+/// Fundamental matrix of an essential matrix.
 pub fn fundamental_of(essential: &Matrix3<f64>, pinhole: &Pinhole) -> Matrix3<f64> {
     let Pinhole { fx, fy, cx, cy, .. } = *pinhole;
     let inverse = Matrix3::new(1.0 / fx, 0.0, -cx / fx, 0.0, 1.0 / fy, -cy / fy, 0.0, 0.0, 1.0);

@@ -20,12 +20,12 @@ const CONVERGED_SHARE: f64 = 1e-6;
 /// Keeps the equations solvable where a pose hangs on nothing.
 const MIN_DAMPING: f64 = 1e-9;
 
-/// What is known of two poses.
+/// Relative pose factor.
 #[derive(Clone, Copy, Debug)]
 pub struct Edge {
     pub a: usize,
     pub b: usize,
-    /// As measured.
+    /// Measured relative pose.
     pub a_from_b: Sim3,
     /// 1/standard deviation of `(ρ, θ, λ)` in a: 1/metres, 1/radians, 1.
     pub weights: Vector7,
@@ -33,7 +33,7 @@ pub struct Edge {
     pub huber: Option<f64>,
 }
 
-/// What is to be solved.
+/// Pose-graph problem over similarities.
 #[derive(Clone, Debug, Default)]
 pub struct PoseGraph {
     /// camera_from_world.

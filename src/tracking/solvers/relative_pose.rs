@@ -10,7 +10,7 @@ use crate::geometry::{Se3, Sim3};
 use crate::tracking::TrackingError;
 use crate::tracking::solvers::pose_graph::Edge;
 
-/// What a standard deviation may be, metres and radians: less is nobody's accuracy and would make the equations stiff.
+/// Range of standard deviations, metres and radians: smaller ones would make the equations stiff.
 const MIN_SIGMA: f64 = 1e-5;
 const MAX_SIGMA_METRES: f64 = 10.0;
 const MAX_METRES: f64 = 1e4;

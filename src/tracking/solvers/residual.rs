@@ -64,7 +64,7 @@ impl Measurement {
         Matrix3::new(fx, 0.0, -fx * p.x * iz, 0.0, fy, -fy * p.y * iz, 0.0, 0.0, depth)
     }
 
-    /// The same without its depth.
+    /// A copy without depth.
     pub fn without_depth(&self) -> Self {
         Self { inverse_depth: None, ..*self }
     }

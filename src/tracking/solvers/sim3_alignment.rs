@@ -144,7 +144,7 @@ impl Pair {
         Self { in_a: known(self.in_a, self.p_in_a.z), in_b: known(self.in_b, self.p_in_b.z), ..*self }
     }
 
-    /// The same, with larger errors allowed.
+    /// Classifies with larger errors allowed.
     fn lenient(&self) -> Self {
         let loosen = |m: Measurement| Measurement {
             pixel_weight: m.pixel_weight / ROUGH_FACTOR,

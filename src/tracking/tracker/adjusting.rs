@@ -151,7 +151,7 @@ impl Tracker {
         Ok(())
     }
 
-    /// What follows when a keyframe's surroundings are as good as they get: a loop may be seen, after which all is adjusted, or some of
+    /// Runs after a keyframe's local bundle adjustment: a loop may be found, after which all is adjusted, or some of
     /// them may have become redundant.
     fn close_loops_and_cull(&mut self, keyframe: usize, times: &mut StageTimes) -> Result<(), TrackingError> {
         let clock = Instant::now();

@@ -4,7 +4,7 @@ use nalgebra::Vector3;
 
 use super::{Image64, ImageGradient64};
 
-/// What a view should look like.
+/// Recorded colour and depth of a view.
 #[derive(Clone, Debug)]
 pub struct Target64 {
     /// Pixels.

@@ -5,7 +5,7 @@ use nalgebra::{Matrix2, Matrix2x3, Matrix3, Vector2, Vector3, Vector4};
 use super::{Cutoffs, Gaussian64, View64, spherical_harmonics};
 use crate::splat::model;
 
-/// What the rasterizer needs of a Gaussian, and what the backward pass wants to see again.
+/// A projected Gaussian, with the intermediate values of the backward pass.
 #[derive(Clone, Debug)]
 pub struct Projected64 {
     /// Projected centre, pixels.

@@ -65,7 +65,7 @@ pub fn conditioning(view: &View64, cloud: &[Gaussian64], slack: f64) -> Conditio
     })
 }
 
-/// The same of each pixel, `[H * W]`.
+/// Conditioning of each pixel, `[H * W]`.
 pub fn pixel_conditioning(view: &View64, cloud: &[Gaussian64], slack: f64) -> Vec<Conditioning> {
     let sorted = sorted(view, cloud);
     let p = &view.camera.pinhole;

@@ -50,7 +50,7 @@ pub fn families(machine: &Machine) -> Vec<Family<'_>> {
     ]
 }
 
-/// What must come of a moved world.
+/// Checks of a moved world.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Expected {
     /// The moved map.

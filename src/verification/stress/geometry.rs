@@ -83,7 +83,7 @@ impl World {
         Se3::from_parts(camera.translation.into(), camera.rotation)
     }
 
-    /// What is measured of a point in the camera's frame, with noise.
+    /// A noisy measurement of a point in the camera frame.
     pub fn measure(&self, rng: &mut Rng, p_in_camera: &Vector3<f64>, with_depth: bool) -> Option<Measurement> {
         let pixel = PINHOLE.project(&(p_in_camera / self.scale))? + noise(rng);
         let (depth, sigma) = (p_in_camera.z, INVERSE_DEPTH_SIGMA / self.scale);
@@ -106,7 +106,7 @@ pub fn small_motion(rng: &mut Rng, metres: f64, rad: f64) -> Se3 {
     se3::exp(&Vector6::new(within(metres), within(metres), within(metres), within(rad), within(rad), within(rad)))
 }
 
-/// What whitened residuals tell of unknowns, at 0: JᵀJ, J by central differences.
+/// Information matrix of whitened residuals at 0: JᵀJ, J by central differences.
 pub fn information(residuals: impl Fn(&DVector<f64>) -> DVector<f64>, unknowns: usize) -> DMatrix<f64> {
     const STEP: f64 = 1e-6;
     let columns: Vec<DVector<f64>> = (0..unknowns)

@@ -79,7 +79,7 @@ fn long(machine: &Machine, rng: &mut Rng, steps: usize) -> Result<Outcome, GpuEr
     Ok(judge(&losses, &on_gpu.download(&machine.gpu)?))
 }
 
-/// Of the batches' mean losses, and the map at the end.
+/// Checks the batches' mean losses and the final map.
 fn judge(losses: &[f64], after: &GaussianCloud) -> Outcome {
     let mut outcome = Outcome::default();
     let [early, middle, late] =

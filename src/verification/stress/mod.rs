@@ -25,7 +25,7 @@ pub use report::{Failure, FamilyReport, Row, StressReport};
 
 use crate::gpu::GpuError;
 
-/// What is tried.
+/// Part of the stress test.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
 #[serde(rename_all = "kebab-case")]
 pub enum Part {
@@ -82,14 +82,14 @@ pub struct Measured {
     pub limit: f64,
 }
 
-/// What came of a case.
+/// Result of a case.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Outcome {
     /// Quantities with their limits.
     pub measured: Vec<Measured>,
     /// Things counted, summed up over a family.
     pub counts: Vec<(&'static str, u64)>,
-    /// What must never be, in words.
+    /// Violated invariants, in words.
     pub faults: Vec<String>,
 }
 

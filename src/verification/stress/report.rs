@@ -40,7 +40,7 @@ pub struct Failure {
     pub what: Vec<String>,
 }
 
-/// What came of one family.
+/// Results of one family.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct FamilyReport {
     /// The part.
@@ -61,7 +61,7 @@ pub struct FamilyReport {
     pub failures: Vec<Failure>,
 }
 
-/// What came of all.
+/// Results of all families.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct StressReport {
     /// All families that ran.
@@ -69,7 +69,7 @@ pub struct StressReport {
 }
 
 impl FamilyReport {
-    /// Of the outcomes in the order of their indices.
+    /// Summarises outcomes in the order of their indices.
     pub(super) fn new(part: Part, name: &str, seed: u64, outcomes: &[Outcome]) -> Self {
         let mut quantities: Vec<&'static str> = Vec::new();
         let mut counts = BTreeMap::new();

@@ -20,7 +20,7 @@ fn direction(rng: &mut Rng) -> Vec3 {
     Vec3::from_array(std::array::from_fn(|_| between(rng, -1.0, 1.0)))
 }
 
-/// What is wrong with a scene. Faults of Gaussians strike every third of them.
+/// Fault of a scene. Faults of Gaussians strike every third of them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Fault {
     None,
@@ -168,7 +168,7 @@ impl Scene {
         Self { camera, cloud }
     }
 
-    /// The same with the world moved (new_from_old) and then made `scale` times as large. Higher harmonics are not turned.
+    /// A copy with the world moved (new_from_old) and then made `scale` times as large. Higher harmonics are not turned.
     pub fn moved(&self, new_from_old: &Se3, scale: f64) -> Self {
         let turn = new_from_old.rotation.coords.map(|v| v as f32);
         let turn = Quat::from_xyzw(turn.x, turn.y, turn.z, turn.w);

@@ -74,7 +74,7 @@ impl Container {
 mod tests {
     use super::*;
 
-    /// What is found of a file with these bytes: its container, and whether it is cut.
+    /// Container of a file with these bytes, and whether the file is cut.
     fn found(bytes: &[u8]) -> Option<(Container, bool)> {
         let container = Container::of(bytes).unwrap()?;
         Some((container, container.is_cut(io::Cursor::new(bytes)).unwrap()))

@@ -87,7 +87,7 @@ impl Records<File> {
 }
 
 impl<R: Read + Seek> Records<R> {
-    /// Of `left` bytes; `path` is named in errors.
+    /// Reads at most `left` bytes; `path` is named in errors.
     pub fn new(reader: R, left: u64, path: &Path) -> Self {
         Self { path: path.into(), reader: BufReader::new(reader), left }
     }

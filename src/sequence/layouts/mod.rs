@@ -1,11 +1,23 @@
-//! The table of dataset layouts. Adding one takes its file, with a [`LayoutRow`], and a row in [`LAYOUTS`].
+//! The table of dataset layouts, and one file for each. Adding one takes its file, with a [`LayoutRow`], and a row in [`LAYOUTS`].
+
+mod colmap;
+mod euroc;
+mod images;
+mod kitti;
+mod replica;
+mod row;
+mod transforms;
+mod tum;
+mod video;
 
 use std::path::Path;
 
 use clap::builder::PossibleValue;
 use serde::{Deserialize, Deserializer, Serialize, Serializer, de};
 
-use super::{Sequence, SequenceError, colmap, euroc, images, kitti, replica, transforms, tum, video};
+use crate::sequence::{Sequence, SequenceError};
+pub(super) use row::LayoutRow;
+pub(super) use video::Video;
 
 /// All layouts, in the order of recognition: the first one whose marker files are there.
 static LAYOUTS: [Layout; 8] = [
@@ -18,31 +30,6 @@ static LAYOUTS: [Layout; 8] = [
     Layout(&video::LAYOUT),
     Layout(&images::LAYOUT),
 ];
-
-/// Frames and image size (pixels) that sample files are parsed for, where a parser needs them.
-pub(super) const SAMPLE_FRAMES: usize = 3;
-pub(super) const SAMPLE_SIZE: (u32, u32) = (8, 6);
-
-/// Results of parsing the same bytes as each kind of file of a layout.
-pub(super) type Parsed = Vec<Result<(), SequenceError>>;
-
-/// What a layout's file provides.
-pub(super) struct LayoutRow {
-    /// Name on the command line and in configurations.
-    pub name: &'static str,
-    /// Files that identify it, for messages.
-    pub marker: &'static str,
-    /// One sentence for `--help`.
-    pub help: &'static str,
-    /// Whether its frames are photos with known poses, each a keyframe, instead of frames of a moving camera.
-    pub is_photos: bool,
-    /// Whether a folder has the marker files.
-    pub recognise: fn(&Path) -> bool,
-    /// Opens a folder, or a video; takes the name of a camera preset, where the layout uses one.
-    pub open: fn(&Path, Option<&str>) -> Result<Sequence, SequenceError>,
-    /// Parses bytes as each kind of file of the layout, for the fuzz target. Images are left to their decoders.
-    pub parse: fn(&[u8]) -> Parsed,
-}
 
 /// Arrangement of a dataset's files.
 #[derive(Clone, Copy)]
@@ -77,6 +64,11 @@ impl Layout {
 
     pub(super) fn of(row: &'static LayoutRow) -> Self {
         Self(row)
+    }
+
+    /// The layout of video files.
+    pub(super) fn video() -> Self {
+        Self(&video::LAYOUT)
     }
 
     pub(super) fn open(self, path: &Path, camera: Option<&str>) -> Result<Sequence, SequenceError> {
@@ -135,18 +127,6 @@ impl<'de> Deserialize<'de> for Layout {
         let name = String::deserialize(deserializer)?;
         let known = || LAYOUTS.iter().map(|layout| layout.name()).collect::<Vec<_>>().join(", ");
         Self::by_name(&name).ok_or_else(|| de::Error::custom(format!("there is no layout `{name}`; known are {}", known())))
-    }
-}
-
-/// Parses bytes as text files of a layout; the one result where they are no UTF-8.
-pub(super) fn parse_text(bytes: &[u8], parse: impl Fn(&str, &Path) -> Parsed) -> Parsed {
-    let path = Path::new("file");
-    match std::str::from_utf8(bytes) {
-        Ok(text) => parse(text, path),
-        Err(error) => {
-            let source = std::io::Error::new(std::io::ErrorKind::InvalidData, error);
-            vec![Err(SequenceError::Read { path: path.into(), source })]
-        }
     }
 }
 

@@ -5,9 +5,9 @@
 
 use std::path::{Path, PathBuf};
 
-use super::layouts::{LayoutRow, parse_text};
-use super::{FrameEntry, Sensor, Sequence, SequenceError, cameras, folder_name, read_text};
+use super::row::{LayoutRow, parse_text};
 use crate::geometry::{Camera, Distortion, Pinhole, Trajectory};
+use crate::sequence::{FrameEntry, Sensor, Sequence, SequenceError, cameras, folder_name, read_text};
 
 /// Colour and depth further apart than this do not belong together (half a frame at 30 Hz, rounded up as the benchmark's tools do).
 const MAX_TIME_DIFFERENCE_S: f64 = 0.02;

@@ -18,9 +18,10 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use image::RgbImage;
 
-use super::layouts::LayoutRow;
-use super::{FrameEntry, Sensor, Sequence, SequenceError, cameras, files_in, images, images_in, read_text};
+use super::images;
+use super::row::LayoutRow;
 use crate::geometry::Camera;
+use crate::sequence::{FrameEntry, Sensor, Sequence, SequenceError, cameras, files_in, images_in, read_text};
 use container::Container;
 use decoder::Decoder;
 
@@ -108,9 +109,9 @@ fn camera_of(video: &Path, named: Option<&str>) -> Result<(Camera, f64), Sequenc
 
 /// A video whose frames are known by their times.
 #[derive(Debug)]
-pub(super) struct Video {
+pub(in crate::sequence) struct Video {
     path: PathBuf,
-    /// Of each frame, since the first; strictly increasing.
+    /// Time of each frame since the first, strictly increasing.
     times_s: Vec<f64>,
     /// So many of them were decoded when the video was opened; the others its container counts, but the file ends before them.
     decodable: usize,
@@ -146,7 +147,7 @@ impl Video {
     }
 
     /// The frame that is shown at `time_s`, one of this video's times.
-    pub(super) fn load(&self, time_s: f64) -> Result<RgbImage, SequenceError> {
+    pub(in crate::sequence) fn load(&self, time_s: f64) -> Result<RgbImage, SequenceError> {
         let failed = |error: opencv::Error| decoder_failed(&self.path, &error);
         let index = self.times_s.partition_point(|t| *t < time_s);
         let unreadable = || SequenceError::VideoFrame { path: self.path.clone(), frame: index };

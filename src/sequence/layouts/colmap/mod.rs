@@ -16,9 +16,9 @@ use std::fs::File;
 use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
-use super::layouts::{LayoutRow, parse_text};
-use super::{FrameEntry, Sensor, Sequence, SequenceError, checks, folder_name, read_text};
+use super::row::{LayoutRow, parse_text};
 use crate::geometry::{Camera, Distortion, Pinhole, Se3, StampedPose, Trajectory};
+use crate::sequence::{FrameEntry, Sensor, Sequence, SequenceError, checks, folder_name, read_text};
 use binary::Records;
 
 /// COLMAP's camera models in the order of their numbers, with how many parameters each has.

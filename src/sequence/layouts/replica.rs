@@ -8,9 +8,9 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
-use super::layouts::{LayoutRow, SAMPLE_FRAMES, parse_text};
-use super::{FrameEntry, Sensor, Sequence, SequenceError, checks, folder_name, images_in, parse_json, read_text};
+use super::row::{LayoutRow, SAMPLE_FRAMES, parse_text};
 use crate::geometry::{Camera, Distortion, Pinhole, StampedPose, Trajectory};
+use crate::sequence::{FrameEntry, Sensor, Sequence, SequenceError, checks, folder_name, images_in, parse_json, read_text};
 
 const FRAMES_PER_S: f64 = 30.0;
 

@@ -12,9 +12,9 @@ use std::sync::Arc;
 use nalgebra::UnitQuaternion;
 use serde::Deserialize;
 
-use super::layouts::{LayoutRow, parse_text};
-use super::{FrameEntry, Sensor, Sequence, SequenceError, checks, folder_name, read_text, stereo};
+use super::row::{LayoutRow, parse_text};
 use crate::geometry::{Camera, Distortion, Pinhole, Se3, StampedPose, Trajectory};
+use crate::sequence::{FrameEntry, Sensor, Sequence, SequenceError, checks, folder_name, read_text, stereo};
 
 /// Left and right further apart than this do not belong together: the cameras are triggered by one signal.
 const MAX_PAIR_NS: u64 = 1_000_000;

@@ -6,9 +6,9 @@
 
 use std::path::{Path, PathBuf};
 
-use super::layouts::{LayoutRow, SAMPLE_FRAMES, parse_text};
-use super::{FrameEntry, Sensor, Sequence, SequenceError, checks, folder_name, images_in, read_text};
+use super::row::{LayoutRow, SAMPLE_FRAMES, parse_text};
 use crate::geometry::{Camera, Distortion, Pinhole, StampedPose, Trajectory};
+use crate::sequence::{FrameEntry, Sensor, Sequence, SequenceError, checks, folder_name, images_in, read_text};
 
 const FRAME_S: f64 = 0.1;
 /// Folder of the left and of the right images, and their cameras in a calibration that names them.

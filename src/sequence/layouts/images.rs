@@ -25,9 +25,9 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
-use super::layouts::{LayoutRow, parse_text};
-use super::{FrameEntry, Sensor, Sequence, SequenceError, checks, folder_name, images_in, read_text};
+use super::row::{LayoutRow, parse_text};
 use crate::geometry::{Camera, Distortion, Pinhole};
+use crate::sequence::{FrameEntry, Sensor, Sequence, SequenceError, checks, folder_name, images_in, read_text};
 
 pub(super) const FILE: &str = "camera.toml";
 
@@ -195,7 +195,7 @@ mod tests {
     /// The documentation shows a file that is read as it stands.
     #[test]
     fn the_example_in_the_documentation_is_valid() {
-        let page = include_str!("../../docs/recordings.md");
+        let page = include_str!("../../../docs/recordings.md");
         let example = page.split("```toml\n").nth(1).unwrap().split("```").next().unwrap();
         let folder = recording(example, &[]);
         assert!(open(&folder).unwrap_err().contains("lists no frames"));

@@ -12,9 +12,9 @@ use std::path::{Path, PathBuf};
 use nalgebra::{UnitQuaternion, Vector3};
 use serde::Deserialize;
 
-use super::layouts::{LayoutRow, SAMPLE_SIZE, parse_text};
-use super::{FrameEntry, Sensor, Sequence, SequenceError, checks, folder_name, parse_json, read_text};
+use super::row::{LayoutRow, SAMPLE_SIZE, parse_text};
 use crate::geometry::{Camera, Distortion, Pinhole, Se3, StampedPose, Trajectory};
+use crate::sequence::{FrameEntry, Sensor, Sequence, SequenceError, checks, folder_name, parse_json, read_text};
 
 const FILE: &str = "transforms.json";
 /// Endings of photos whose path leaves it out.
@@ -63,7 +63,7 @@ fn open(folder: &Path) -> Result<Sequence, SequenceError> {
     Ok(sequence)
 }
 
-/// What the file says, checked.
+/// Checked content of the file.
 pub(super) struct Transforms {
     pub lens: Lens,
     /// Each photo's path as it is written, and world_from_camera.
