@@ -21,7 +21,7 @@ const MAX_PAIR_NS: u64 = 1_000_000;
 /// Values in a `sensor.yaml`; the datasets' have about 50.
 const MAX_NODES: usize = 10_000;
 
-/// The layout's row in [`super::layouts::LAYOUTS`].
+/// The layout's row in [`super::LAYOUTS`].
 pub(super) const LAYOUT: LayoutRow = LayoutRow {
     name: "euroc",
     marker: "mav0/cam0",

@@ -53,7 +53,7 @@ pub(super) fn usual_fps() -> f64 {
     30.0
 }
 
-/// The layout's row in [`super::layouts::LAYOUTS`].
+/// The layout's row in [`super::LAYOUTS`].
 pub(super) const LAYOUT: LayoutRow = LayoutRow {
     name: "images",
     marker: "camera.toml",

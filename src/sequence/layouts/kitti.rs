@@ -15,7 +15,7 @@ const FRAME_S: f64 = 0.1;
 const CAMERAS: [(&str, &str, &str, &str); 3] =
     [("image_2", "image_3", "P2", "P3"), ("image_0", "image_1", "P0", "P1"), ("image_l", "image_r", "P0", "P1")];
 
-/// The layout's row in [`super::layouts::LAYOUTS`].
+/// The layout's row in [`super::LAYOUTS`].
 pub(super) const LAYOUT: LayoutRow = LayoutRow {
     name: "kitti",
     marker: "calib.txt and image_0",

@@ -14,7 +14,7 @@ use crate::sequence::{FrameEntry, Sensor, Sequence, SequenceError, checks, folde
 
 const FRAMES_PER_S: f64 = 30.0;
 
-/// The layout's row in [`super::layouts::LAYOUTS`].
+/// The layout's row in [`super::LAYOUTS`].
 pub(super) const LAYOUT: LayoutRow = LayoutRow {
     name: "replica",
     marker: "traj.txt and results",

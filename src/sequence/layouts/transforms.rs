@@ -20,7 +20,7 @@ const FILE: &str = "transforms.json";
 /// Endings of photos whose path leaves it out.
 const ENDINGS: [&str; 4] = ["", ".png", ".jpg", ".jpeg"];
 
-/// The layout's row in [`super::layouts::LAYOUTS`].
+/// The layout's row in [`super::LAYOUTS`].
 pub(super) const LAYOUT: LayoutRow = LayoutRow {
     name: "transforms",
     marker: "transforms.json",

@@ -20,7 +20,7 @@ struct ListedImage {
 /// A line of a list: its number, its time in seconds, its file.
 type Listed<'a> = (usize, f64, &'a str);
 
-/// The layout's row in [`super::layouts::LAYOUTS`].
+/// The layout's row in [`super::LAYOUTS`].
 pub(super) const LAYOUT: LayoutRow = LayoutRow {
     name: "tum",
     marker: "rgb.txt",

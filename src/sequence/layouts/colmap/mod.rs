@@ -60,7 +60,7 @@ fn model_folder(folder: &Path) -> Option<PathBuf> {
     ["sparse/0", "sparse"].map(|model| folder.join(model)).into_iter().find(has_cameras)
 }
 
-/// The layout's row in [`super::layouts::LAYOUTS`].
+/// The layout's row in [`super::LAYOUTS`].
 pub(super) const LAYOUT: LayoutRow = LayoutRow {
     name: "colmap",
     marker: "images and sparse/0",

@@ -31,7 +31,7 @@ const MOST_MISSING: usize = 1_000_000;
 /// Frames that a decoder holds back: 16 to put them in order (H.264), and one for each of its threads.
 const MOST_DELAYED: usize = 32;
 
-/// The layout's row in [`super::layouts::LAYOUTS`].
+/// The layout's row in [`super::LAYOUTS`].
 pub(super) const LAYOUT: LayoutRow = LayoutRow {
     name: "video",
     marker: "camera.toml and a video",
