@@ -309,9 +309,13 @@ impl MappingConfig {
             ("insertion.opacity", s.opacity),
             ("insertion.min_depth_metres", s.min_depth_metres),
             ("insertion.max_depth_metres", s.max_depth_metres),
+            ("tile_sampling.share", self.tile_sampling.share),
         ];
         if let Some((name, value)) = positive.iter().find(|(_, value)| !(value.is_finite() && *value > 0.0)) {
             return Err(format!("mapping.{name} must be positive, not {value}"));
+        }
+        if !(self.tile_sampling.noise.is_finite() && self.tile_sampling.noise >= 0.0) {
+            return Err(format!("mapping.tile_sampling.noise must be zero or more, not {}", self.tile_sampling.noise));
         }
         if self.window.recent == 0 {
             return Err("mapping.window.recent must be at least 1".into());
@@ -320,8 +324,14 @@ impl MappingConfig {
         if self.refine.density_every == 0 || self.refine.density_views == 0 {
             return Err("mapping.refine.density_every and mapping.refine.density_views must be at least 1".into());
         }
-        if ![self.refine.growth_share, self.refine.half_size_share].iter().all(|share| (0.0..=1.0).contains(share)) {
-            return Err("mapping.refine.growth_share and mapping.refine.half_size_share must lie between 0 and 1".into());
+        let closed_shares = [
+            ("refine.growth_share", self.refine.growth_share),
+            ("refine.half_size_share", self.refine.half_size_share),
+            ("tile_sampling.min_share", self.tile_sampling.min_share),
+            ("window.final_lr_scale", self.window.final_lr_scale),
+        ];
+        if let Some((name, value)) = closed_shares.iter().find(|(_, value)| !(0.0..=1.0).contains(value)) {
+            return Err(format!("mapping.{name} must lie between 0 and 1, not {value}"));
         }
         if self.points.size_range < 1.0 {
             return Err(format!("mapping.points.size_range must be at least 1, not {}", self.points.size_range));
