@@ -232,6 +232,24 @@ mod tests {
     }
 
     #[test]
+    fn formats_are_known_by_name_and_extension() {
+        assert_eq!(MapFormat::all().len(), FORMATS.len());
+        assert_eq!((MapFormat::default().name(), MapFormat::default().extension()), ("ply", "ply"));
+        assert_eq!(MapFormat::by_name("xyz"), None);
+        for unknown in ["map", "map.xyz", "ply"] {
+            assert_eq!(MapFormat::of_path(Path::new(unknown)), None, "{unknown}");
+        }
+        assert_eq!(MapFormat::of_path(Path::new("a/MAP.PLY")), Some(MapFormat::default()));
+        for format in MapFormat::all() {
+            assert_eq!(format!("{format:?}"), format.name());
+            assert_eq!(<MapFormat as clap::ValueEnum>::from_str(format.name(), false), Ok(*format));
+            assert_eq!(serde_json::from_str::<MapFormat>(&format!("\"{}\"", format.name())).unwrap(), *format);
+        }
+        let unknown = serde_json::from_str::<MapFormat>("\"xyz\"").unwrap_err().to_string();
+        assert!(unknown.contains("xyz") && unknown.contains("ply"), "{unknown}");
+    }
+
+    #[test]
     fn every_format_gives_back_what_it_took() {
         let folder = tempfile::tempdir().unwrap();
         for &format in MapFormat::all() {
@@ -250,6 +268,7 @@ mod tests {
                 assert!(back.raw_opacities.iter().zip(&cloud.raw_opacities).all(|(a, b)| (a - b).abs() < 1e-6));
                 assert!(back.rotations.iter().zip(&cloud.rotations).all(|(a, b)| a.dot(*b).abs() > 1.0 - 1e-6));
                 assert_eq!(format.encode(&back).unwrap(), bytes, "exporting again changes nothing");
+                assert_eq!(format.decode(&bytes).unwrap(), back);
             }
         }
     }

@@ -82,5 +82,8 @@ mod tests {
         let still = [Vector3::zeros(); 4];
         assert!(align(&still, &still, true).is_none() && align(&[], &[], false).is_none());
         assert_eq!(align(&still, &still, false).unwrap().translation, Vector3::zeros());
+        let apart = [Vector3::x(), Vector3::y(), Vector3::z(), Vector3::zeros()];
+        assert!(align(&still, &apart, true).is_none() && align(&apart, &still, true).is_none());
+        assert!(align(&apart, &apart[..3], false).is_none());
     }
 }

@@ -178,5 +178,48 @@ mod tests {
         let ray = |p: &Pinhole| ((-0.5 - p.cx) / p.fx, (-0.5 - p.cy) / p.fy);
         assert!((ray(&PINHOLE).0 - ray(&half).0).abs() < 1e-12 && (ray(&PINHOLE).1 - ray(&half).1).abs() < 1e-12);
         assert_eq!((half.width, half.height), (320, 240));
+        assert_eq!((half.fx, half.fy), (PINHOLE.fx / 2.0, PINHOLE.fy / 2.0));
+        let odd = PINHOLE.scaled(0.001);
+        assert_eq!((odd.width, odd.height), (1, 1));
+    }
+
+    #[test]
+    fn the_image_reaches_to_the_centres_of_its_outer_pixels() {
+        let contains = |x: f64, y: f64, margin: f64| PINHOLE.contains(&Vector2::new(x, y), margin);
+        assert!(contains(0.0, 0.0, 0.0) && contains(639.0, 479.0, 0.0) && contains(10.0, 10.0, 10.0) && contains(629.0, 469.0, 10.0));
+        for (x, y) in [(-0.01, 240.0), (320.0, -0.01), (639.01, 240.0), (320.0, 479.01), (f64::NAN, 240.0)] {
+            assert!(!contains(x, y, 0.0), "{x} {y}");
+        }
+        for (x, y) in [(9.9, 240.0), (320.0, 9.9), (629.1, 240.0), (320.0, 469.1)] {
+            assert!(!contains(x, y, 10.0) && contains(x, y, 9.0), "{x} {y}");
+        }
+    }
+
+    #[test]
+    fn what_lies_in_the_plane_of_the_camera_has_no_pixel() {
+        let project = |z: f64| PINHOLE.project(&Vector3::new(0.1, 0.1, z));
+        assert!(project(2e-6).is_some() && [1e-6, 0.0, -1.0, f64::NAN].iter().all(|z| project(*z).is_none()));
+    }
+
+    #[test]
+    fn each_coefficient_distorts() {
+        assert!(Distortion::default().is_zero());
+        let [a, b, c, d, e] = std::array::from_fn(|i| {
+            let k: [f64; 5] = std::array::from_fn(|j| f64::from(u8::from(i == j)) * 0.1);
+            Distortion { k1: k[0], k2: k[1], p1: k[2], p2: k[3], k3: k[4] }
+        });
+        let at = Vector2::new(0.3, -0.2);
+        let r2: f64 = 0.13;
+        // Brown–Conrady, term by term (OpenCV's `undistortPoints`).
+        let expected = [
+            at * (1.0 + 0.1 * r2),
+            at * (1.0 + 0.1 * r2 * r2),
+            at + Vector2::new(2.0 * 0.1 * at.x * at.y, 0.1 * (r2 + 2.0 * at.y * at.y)),
+            at + Vector2::new(0.1 * (r2 + 2.0 * at.x * at.x), 2.0 * 0.1 * at.x * at.y),
+            at * (1.0 + 0.1 * r2 * r2 * r2),
+        ];
+        for (lens, expected) in [a, b, c, d, e].iter().zip(expected) {
+            assert!(!lens.is_zero() && (lens.distort(&at) - expected).norm() < 1e-15, "{lens:?}");
+        }
     }
 }
