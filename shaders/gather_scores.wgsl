@@ -6,7 +6,7 @@
 @group(0) @binding(2) var<storage, read> intersection_counts: array<u32>;
 @group(0) @binding(3) var<storage, read> intersection_scores: array<vec4<f32>>;
 @group(0) @binding(4) var<storage, read> projected: array<vec4<f32>>;
-// [2, capacity], see `GaussianScore`: (wrong pixels, the same times each view's loss, Σ w, largest w); (‖∂‖, ‖Σ|∂|‖ in normalised
+// [2, capacity], see `GaussianScore`: (error pixels, the same times each view's loss, Σ w, largest w); (‖∂‖, ‖Σ|∂|‖ in normalised
 // device coordinates, views that blended it, finest metres per pixel).
 @group(0) @binding(5) var<storage, read_write> scores: array<vec4<f32>>;
 @group(0) @binding(6) var<uniform> setup: ScoreSetup;

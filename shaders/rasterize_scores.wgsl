@@ -1,11 +1,11 @@
 // What each (Gaussian, tile) intersection does to the pixels that it was really blended into, written over the intersection's gradient, whose turn comes
 // after: the raw material of density control (FastGS, arXiv 2511.04283; absolute gradients after AbsGS, arXiv 2404.10484).
 //
-// A pixel counts as wrong where its error exceeds a multiple of the view's mean error, and the noise of the sensor: one hot pixel
+// An error pixel is one whose error exceeds a multiple of the view's mean error, and the noise of the sensor: one hot pixel
 // does not rescale the mask, and a view that is good already has few.
 
 struct ScoreSetup {
-    // Multiple of the mean absolute error above which a pixel is wrong; and the error below which none is.
+    // Multiple of the mean absolute error above which a pixel is an error pixel; and the error below which none is.
     error_ratio: f32,
     noise: f32,
     ssim_weight: f32,
@@ -18,7 +18,7 @@ struct ScoreSetup {
 
 // Of a intersection, over the pixels of its tile.
 struct PairScore {
-    // (wrong pixels, Σ w, largest w, 0), w what the Gaussian adds to a pixel.
+    // (error pixels, Σ w, largest w, 0), w what the Gaussian adds to a pixel.
     seen: vec4<f32>,
     // By the image mean, in pixels: (Σ ∂x, Σ ∂y, Σ|∂x|, Σ|∂y|).
     gradient: vec4<f32>,
@@ -38,10 +38,10 @@ fn main(
     let block = place.block;
     let threshold = max(setup.noise, setup.error_ratio * total.x / (3.0 * setup.pixels));
     var pixels: array<PixelState, STRIPS>;
-    var wrong: array<vec4<f32>, STRIPS>;
+    var is_error: array<vec4<f32>, STRIPS>;
     for (var s = 0u; s < STRIPS; s++) {
         pixels[s] = load_pixels(place, s);
-        wrong[s] = wrong_pixels(place, s, threshold);
+        is_error[s] = error_pixels(place, s, threshold);
     }
     workgroupBarrier();
     let end = workgroupUniformLoad(&longest);
@@ -63,7 +63,7 @@ fn main(
                 var sum = PairScore(vec4(0.0), vec4(0.0));
                 for (var s = 0u; s < STRIPS; s++) {
                     var strip = pixels[s];
-                    add_score(dx, block.y + f32(s) - mean.y, mean, shape, color, k, wrong[s], &strip, &sum);
+                    add_score(dx, block.y + f32(s) - mean.y, mean, shape, color, k, is_error[s], &strip, &sum);
                     pixels[s] = strip;
                 }
                 let to = partials + (k - chunk) * 2u * TILE_THREADS + place.thread;
@@ -92,15 +92,15 @@ fn main(
 }
 
 // 1 where the error of a strip's pixel exceeds the threshold.
-fn wrong_pixels(place: Place, strip: u32, threshold: f32) -> vec4<f32> {
+fn error_pixels(place: Place, strip: u32, threshold: f32) -> vec4<f32> {
     let errors = view.width * view.height + place.block.first + strip * view.width;
-    var wrong = vec4(0.0);
+    var is_error = vec4(0.0);
     for (var p = 0u; p < 4u; p++) {
         if place.block.columns[p] && strip < place.block.rows && image_gradients[errors + p].y > threshold {
-            wrong[p] = 1.0;
+            is_error[p] = 1.0;
         }
     }
-    return wrong;
+    return is_error;
 }
 
 // Takes a strip past one Gaussian as `add_gradient` does, and adds to its score.
@@ -111,7 +111,7 @@ fn add_score(
     shape: vec4<f32>,
     color: vec4<f32>,
     position: u32,
-    wrong: vec4<f32>,
+    is_error: vec4<f32>,
     pixels: ptr<function, PixelState>,
     sum: ptr<function, PairScore>,
 ) {
@@ -122,7 +122,7 @@ fn add_score(
     let by_x = 2.0 * passed.q * shape.x * u;
     let by_y = 2.0 * passed.q * (shape.y * u + shape.z * v);
     let ones = vec4(1.0);
-    let blended = select(vec4(0.0), wrong, passed.hit);
+    let blended = select(vec4(0.0), is_error, passed.hit);
     let largest = max(max(weight.x, weight.y), max(weight.z, weight.w));
     let before = (*sum).seen;
     (*sum).seen = vec4(before.x + dot(blended, ones), before.y + dot(weight, ones), max(before.z, largest), 0.0);

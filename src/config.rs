@@ -137,8 +137,9 @@ pub enum ConfigError {
 }
 
 /// Dotted keys of earlier versions, and those that replaced them; keys of a section before the section itself.
-const RENAMED: [(&str, &str); 25] = [
+const RENAMED: [(&str, &str); 26] = [
     ("mapping.density.vcd.min_worth", "mapping.density.multi_view.min_contribution"),
+    ("mapping.density.vcd.wrong_pixels", "mapping.density.multi_view.error_pixels"),
     ("mapping.density.multi_view.min_worth", "mapping.density.multi_view.min_contribution"),
     ("mapping.density.vcd", "mapping.density.multi_view"),
     ("mapping.window.last_pace", "mapping.window.final_lr_scale"),

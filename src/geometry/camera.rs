@@ -186,7 +186,9 @@ mod tests {
     #[test]
     fn the_image_reaches_to_the_centres_of_its_outer_pixels() {
         let contains = |x: f64, y: f64, margin: f64| PINHOLE.contains(&Vector2::new(x, y), margin);
-        assert!(contains(0.0, 0.0, 0.0) && contains(639.0, 479.0, 0.0) && contains(10.0, 10.0, 10.0) && contains(629.0, 469.0, 10.0));
+        assert!(
+            contains(0.0, 0.0, 0.0) && contains(639.0, 479.0, 0.0) && contains(10.0, 10.0, 10.0) && contains(629.0, 469.0, 10.0)
+        );
         for (x, y) in [(-0.01, 240.0), (320.0, -0.01), (639.01, 240.0), (320.0, 479.01), (f64::NAN, 240.0)] {
             assert!(!contains(x, y, 0.0), "{x} {y}");
         }

@@ -272,7 +272,7 @@ impl MappingConfig {
         self.schedule.coarse_share > 0.0 || (self.refine.steps > 0 && self.refine.half_size_share > 0.0)
     }
 
-    /// Says what is wrong with the values, if anything.
+    /// Checks every value.
     ///
     /// # Errors
     /// A description of the first invalid value.

@@ -31,7 +31,7 @@ impl Default for ExposureConfig {
 }
 
 impl ExposureConfig {
-    /// Says what is wrong with the values, if anything.
+    /// Checks every value.
     ///
     /// # Errors
     /// A description of the first invalid value.

@@ -63,7 +63,7 @@ impl LimitsConfig {
         self.max_keyframes.min(by_memory).max(LEAST_KEYFRAMES)
     }
 
-    /// Says what is wrong with the values, if anything.
+    /// Checks every value.
     ///
     /// # Errors
     /// A description of the first invalid value.

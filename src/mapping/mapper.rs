@@ -25,7 +25,7 @@ use super::schedule::{self, Session, Step};
 use super::{Keyframe, KeyframeId, LimitsConfig, MappingConfig, exposure, initialise_from_points, insertion, limits};
 use crate::geometry::Se3;
 use crate::gpu::{Gpu, GpuError};
-use crate::optimise::{AdamConfig, StepReport, Trainer, TrainingView, WrongPixels};
+use crate::optimise::{AdamConfig, ErrorPixels, StepReport, Trainer, TrainingView};
 use crate::render::{GpuCloud, Plan, Rendered};
 use crate::sequence::{KnownPoint, RectifiedImage};
 use crate::splat::{Exposure, GaussianCloud, ViewCamera};
@@ -356,7 +356,7 @@ impl Mapper {
         }
     }
 
-    fn steps(&mut self, batch: &[Step], scored: Option<WrongPixels>, adam: &AdamConfig) -> Result<Vec<StepReport>, MappingError> {
+    fn steps(&mut self, batch: &[Step], scored: Option<ErrorPixels>, adam: &AdamConfig) -> Result<Vec<StepReport>, MappingError> {
         // A pose is refined by its whole image.
         let tile_sampling = self.config.tile_sampling.sampling().filter(|_| !self.config.refine_poses.enabled);
         let view = |step: &Step| {

@@ -49,7 +49,7 @@ impl Default for PlaneSweepConfig {
 }
 
 impl PlaneSweepConfig {
-    /// Says what is wrong with the values, if anything.
+    /// Checks every value.
     pub(super) fn validate(&self) -> Result<(), String> {
         if !(8..=256).contains(&self.planes) || !(1..=MOST_VIEWS).contains(&self.views) {
             return Err(format!("planes must lie between 8 and 256, and views between 1 and {MOST_VIEWS}"));

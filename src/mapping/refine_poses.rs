@@ -63,7 +63,7 @@ impl Default for RefinePosesConfig {
 }
 
 impl RefinePosesConfig {
-    /// Says what is wrong with the values, if anything.
+    /// Checks every value.
     pub(super) fn validate(&self) -> Result<(), String> {
         let values = [
             ("lr_rotation", self.lr_rotation),

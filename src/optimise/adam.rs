@@ -63,7 +63,7 @@ impl Default for AdamConfig {
 }
 
 impl AdamConfig {
-    /// Says what is wrong with the values, if anything.
+    /// Checks every value.
     ///
     /// # Errors
     /// A description of the first invalid value.

@@ -10,6 +10,6 @@ mod trainer;
 
 pub use adam::AdamConfig;
 pub use loss::{LossConfig, LossTerms, TargetImage};
-pub use scores::{GaussianScore, WrongPixels};
+pub use scores::{ErrorPixels, GaussianScore};
 pub use tile_sampling::TileSampling;
 pub use trainer::{Gradients, ImageGradients, StepReport, Trainer, TrainerState, TrainingView};

@@ -7,9 +7,9 @@ use crate::render::{GpuCloud, PreparedView, Rasterizer, shaders};
 
 use bytemuck::Zeroable;
 
-/// When a pixel counts as wrong.
+/// Definition of an error pixel (the high-error mask of FastGS).
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct WrongPixels {
+pub struct ErrorPixels {
     /// Its error exceeds the view's mean error this many times,
     pub error_ratio: f32,
     /// and is no noise: mean absolute colour error, 0 to 1.
@@ -19,10 +19,10 @@ pub struct WrongPixels {
 /// What some views say of one Gaussian.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct GaussianScore {
-    /// Wrong pixels into which it was blended, over all views.
-    pub wrong_pixels: f32,
+    /// Error pixels into which it was blended, over all views.
+    pub error_pixels: f32,
     /// The same, each view's times the view's loss.
-    pub weighted_wrong_pixels: f32,
+    pub weighted_error_pixels: f32,
     /// Sum and maximum of what it added to a pixel, 0 to 1.
     pub weight_sum: f32,
     /// Maximum of the blending weights, 0 to 1.
@@ -99,7 +99,7 @@ impl Scores {
         rasterizer: &Rasterizer,
         prepared: &PreparedView,
         image: &ScoredImage<'_>,
-        wrong: &WrongPixels,
+        wrong: &ErrorPixels,
     ) {
         let (gpu, ws) = (rasterizer.gpu(), &rasterizer.workspace);
         let pixels = prepared.view.pixels() as f32;
@@ -140,8 +140,8 @@ impl Scores {
         let seen: Vec<[f32; 4]> = self.scores.read(gpu, 0, cloud.len())?;
         let gradients: Vec<[f32; 4]> = self.scores.read(gpu, self.capacity, cloud.len())?;
         let score = |(s, g): (&[f32; 4], &[f32; 4])| GaussianScore {
-            wrong_pixels: s[0],
-            weighted_wrong_pixels: s[1],
+            error_pixels: s[0],
+            weighted_error_pixels: s[1],
             weight_sum: s[2],
             weight_max: s[3],
             gradient: g[0],

@@ -12,7 +12,7 @@ use bytemuck::{Pod, Zeroable};
 
 use super::image_buffers::{self, ImageBuffers};
 use super::kernels::Kernels;
-use super::scores::{GaussianScore, ScoredImage, Scores, WrongPixels};
+use super::scores::{ErrorPixels, GaussianScore, ScoredImage, Scores};
 use super::tile_sampling::{TileSampler, TileSampling};
 use super::{AdamConfig, LossConfig, LossTerms, TargetImage};
 use crate::gpu::{Gpu, GpuBuffer, GpuError};
@@ -39,7 +39,7 @@ pub struct TrainingView<'a> {
     /// Recorded image and depth.
     pub target: &'a TargetImage,
     /// Whether the step also scores the Gaussians (see [`Trainer::begin_scores`]).
-    pub scored: Option<WrongPixels>,
+    pub scored: Option<ErrorPixels>,
     /// Factor on all learning rates of the step.
     pub lr_scale: f32,
     /// Factor on the weight of the target's depth in the loss: 1 if a sensor measured it.
@@ -90,7 +90,7 @@ enum Objective<'a> {
     Image {
         target: &'a TargetImage,
         loss: (&'a LossConfig, f32),
-        scored: Option<&'a WrongPixels>,
+        scored: Option<&'a ErrorPixels>,
         tile_sampling: Option<(TileSampling, u32)>,
     },
     /// Gradients by the image are in the buffer already.
@@ -356,7 +356,7 @@ impl Trainer {
             tile_sampling.iter().for_each(|_| self.sampler.encode_fill(&mut pass, &self.rasterizer, &self.images[0]));
             self.encode_loss(&mut pass, loss.0, loss.1);
             let image = ScoredImage { gradients: &self.images[0].gradients, loss_total: &self.loss_total, loss: loss.0 };
-            scored.iter().for_each(|wrong| self.scores.encode(&mut pass, &self.rasterizer, &prepared, &image, wrong));
+            scored.iter().for_each(|pixels| self.scores.encode(&mut pass, &self.rasterizer, &prepared, &image, pixels));
         }
         self.encode_backward(&mut pass, cloud, &prepared, sink);
         gpu.mark(&mut pass, Self::END_MARK);

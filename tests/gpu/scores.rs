@@ -2,7 +2,7 @@
 
 use fastrand::Rng;
 use image::{Rgb, RgbImage};
-use keysplat::optimise::{AdamConfig, LossConfig, TargetImage, Trainer, TrainingView, WrongPixels};
+use keysplat::optimise::{AdamConfig, ErrorPixels, LossConfig, TargetImage, Trainer, TrainingView};
 use keysplat::render::{BlendForm, GpuCloud};
 use keysplat::splat::ShDegree;
 use keysplat::verification::reference::loss::{LossWeights, Target64, loss};
@@ -16,7 +16,7 @@ const TOLERANCE: f64 = 1e-3;
 fn scores_are_those_of_their_definition() {
     let Some(gpu) = crate::common::requirements::adapter() else { return };
     let (loss_config, wrong_config) =
-        (LossConfig { depth_weight: 0.0, ..LossConfig::default() }, WrongPixels { error_ratio: 1.2, noise: 0.05 });
+        (LossConfig { depth_weight: 0.0, ..LossConfig::default() }, ErrorPixels { error_ratio: 1.2, noise: 0.05 });
     let mut clear_cuts = 0;
     for (seed, form) in (0..3).flat_map(|seed| BlendForm::ALL.map(|form| (seed, form))) {
         let mut rng = Rng::with_seed(40 + seed);
@@ -66,11 +66,11 @@ fn scores_are_those_of_their_definition() {
         if clear_cut {
             compare(
                 "wrong pixels",
-                found.iter().map(|s| s.wrong_pixels).collect(),
-                expected.iter().map(|s| 2.0 * s.wrong_pixels).collect(),
+                found.iter().map(|s| s.error_pixels).collect(),
+                expected.iter().map(|s| 2.0 * s.error_pixels).collect(),
             );
-            let weighted = expected.iter().map(|s| 2.0 * s.wrong_pixels * total).collect();
-            compare("weighted wrong pixels", found.iter().map(|s| s.weighted_wrong_pixels).collect(), weighted);
+            let weighted = expected.iter().map(|s| 2.0 * s.error_pixels * total).collect();
+            compare("weighted wrong pixels", found.iter().map(|s| s.weighted_error_pixels).collect(), weighted);
         }
         let views = |s: &f32, e: f64| *s == if e > 0.0 { 2.0 } else { 0.0 };
         assert!(found.iter().zip(&expected).all(|(s, e)| views(&s.views, e.weight_sum)), "seed {seed}, {form:?}");

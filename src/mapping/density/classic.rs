@@ -2,8 +2,8 @@
 
 use super::{Candidate, ClassicConfig, Verdict};
 
-pub(super) fn judge(candidates: &[Candidate], config: &ClassicConfig) -> Vec<Verdict> {
-    let judge = |c: &Candidate| {
+pub(super) fn decide(candidates: &[Candidate], config: &ClassicConfig) -> Vec<Verdict> {
+    let decide = |c: &Candidate| {
         if c.score.views == 0.0 || c.score.gradient / c.score.views < config.gradient {
             Verdict::Keep
         } else if c.pixels() > config.split_pixels {
@@ -12,5 +12,5 @@ pub(super) fn judge(candidates: &[Candidate], config: &ClassicConfig) -> Vec<Ver
             Verdict::Clone
         }
     };
-    candidates.iter().map(judge).collect()
+    candidates.iter().map(decide).collect()
 }

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::optimise::WrongPixels;
+use crate::optimise::ErrorPixels;
 
 /// How the map's density is controlled after each keyframe.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -44,17 +44,17 @@ pub struct DensityConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct MultiViewConfig {
-    /// A pixel is wrong where its error exceeds the view's mean error this many times,
+    /// An error pixel exceeds the view's mean error by this factor,
     pub error_ratio: f32,
     /// and this much: mean absolute colour error, 0 to 1.
     pub noise: f32,
-    /// A Gaussian is divided if it has more wrong pixels than this in the mean of the views
-    pub wrong_pixels: f32,
+    /// A Gaussian is split if it covers more error pixels than this in the mean of the views,
+    pub error_pixels: f32,
     /// its mean absolute gradient (normalised device coordinates) exceeds this,
     pub absolute_gradient: f32,
     /// and its standard deviation this many pixels of the nearest view: finer detail than that no view shows.
     pub split_pixels: f32,
-    /// At most this share of the scored Gaussians is divided at once, those with most wrong pixels first.
+    /// At most this share of the scored Gaussians is divided at once, those with most error pixels first.
     pub max_growth: f32,
     /// Keyframes that a Gaussian is left in peace after it came.
     pub min_age: u32,
@@ -96,7 +96,7 @@ impl Default for MultiViewConfig {
         Self {
             error_ratio: 1.5,
             noise: 0.02,
-            wrong_pixels: 5.0,
+            error_pixels: 5.0,
             absolute_gradient: 1.2e-3,
             split_pixels: 1.5,
             max_growth: 0.015,
@@ -116,9 +116,9 @@ impl Default for ClassicConfig {
 
 impl DensityConfig {
     /// High-error mask of the Gaussian scores.
-    pub fn wrong_pixels(&self) -> WrongPixels {
+    pub fn error_pixels(&self) -> ErrorPixels {
         let MultiViewConfig { error_ratio, noise, .. } = self.multi_view;
-        WrongPixels { error_ratio, noise }
+        ErrorPixels { error_ratio, noise }
     }
 
     /// A copy without densification.
@@ -128,7 +128,7 @@ impl DensityConfig {
         still
     }
 
-    /// Says what is wrong with the values, if anything.
+    /// Checks every value.
     ///
     /// # Errors
     /// A description of the first invalid value.
@@ -157,7 +157,7 @@ impl DensityConfig {
         if let Some((name, value)) = positive.iter().find(|(_, value)| !(value.is_finite() && *value > 0.0)) {
             return Err(format!("{name} must be positive, not {value}"));
         }
-        let thresholds = [v.error_ratio, v.wrong_pixels, v.absolute_gradient, v.max_growth, v.min_contribution, c.gradient];
+        let thresholds = [v.error_ratio, v.error_pixels, v.absolute_gradient, v.max_growth, v.min_contribution, c.gradient];
         if thresholds.iter().any(|t| !(t.is_finite() && *t >= 0.0)) {
             return Err("thresholds must be finite and not negative".into());
         }

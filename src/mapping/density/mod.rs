@@ -49,11 +49,11 @@ impl Candidate {
     }
 }
 
-/// Judges every Gaussian; those gone bad (NaN) are removed whatever the strategy. At most `most` are left, undivided ones first.
+/// Decides on every Gaussian; those with a NaN are removed whatever the strategy. At most `most` are left, undivided ones first.
 pub(super) fn plan(candidates: &[Candidate], most: usize, config: &DensityConfig) -> Plan {
     let verdicts = match config.strategy {
-        DensityStrategy::MultiView => multi_view::judge(candidates, &config.multi_view),
-        DensityStrategy::Classic => classic::judge(candidates, &config.classic),
+        DensityStrategy::MultiView => multi_view::decide(candidates, &config.multi_view),
+        DensityStrategy::Classic => classic::decide(candidates, &config.classic),
         DensityStrategy::None => vec![Verdict::Keep; candidates.len()],
     };
     let mut plan = Plan::default();
@@ -96,87 +96,4 @@ fn divide(parent: u32, of: &Candidate, clone: bool) -> [Child; 2] {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use glam::Quat;
-
-    /// A disc of 10 cm by 2 cm a metre away, well seen and well placed.
-    fn good() -> Candidate {
-        Candidate {
-            geometry: GaussianGeometry {
-                mean: Vec3::new(0.0, 0.0, 1.0),
-                raw_opacity: raw_opacity_from_opacity(0.6),
-                log_scale: Vec3::new(0.02, 0.1, 0.01).map(f32::ln),
-                rotation: Quat::from_rotation_z(std::f32::consts::FRAC_PI_2),
-            },
-            score: GaussianScore {
-                weight_sum: 80.0,
-                weight_max: 0.5,
-                views: 4.0,
-                metres_per_pixel: 0.005,
-                ..GaussianScore::default()
-            },
-            history: GaussianHistory { age: 5, views: 12, best_weight: 0.5, contribution: 20.0, anchor: 0 },
-        }
-    }
-
-    fn shaped(mut candidate: Candidate, change: impl Fn(&mut GaussianGeometry)) -> Candidate {
-        change(&mut candidate.geometry);
-        candidate
-    }
-
-    fn wrong() -> Candidate {
-        let score = GaussianScore {
-            wrong_pixels: 80.0,
-            weighted_wrong_pixels: 8.0,
-            absolute_gradient: 0.1,
-            gradient: 0.05,
-            ..good().score
-        };
-        Candidate { score, ..good() }
-    }
-
-    #[test]
-    fn vcd_divides_what_several_views_call_too_coarse_and_nothing_else() {
-        let config = DensityConfig {
-            multi_view: MultiViewConfig { max_growth: 1.0, ..MultiViewConfig::default() },
-            ..DensityConfig::default()
-        };
-        let fine = shaped(wrong(), |g| g.log_scale = Vec3::splat(0.001f32.ln()));
-        let young = Candidate { history: GaussianHistory { age: 0, ..good().history }, ..wrong() };
-        let unseen = Candidate { score: GaussianScore::default(), ..wrong() };
-        let plan = plan(&[good(), wrong(), fine, young, unseen], 100, &config);
-        assert_eq!(plan.keep, [0, 2, 3, 4]);
-        let [a, b] = &plan.children[..] else { panic!("{:?}", plan.children) };
-        assert_eq!((a.parent, b.parent), (1, 1));
-        // Along the long axis, which the rotation lays along -x.
-        assert!((a.mean - b.mean).length() > 0.1 && (a.mean - b.mean).y.abs() < 1e-6);
-        assert!((a.mean + b.mean - 2.0 * wrong().geometry.mean).length() < 1e-6 && a.log_scale.y < wrong().geometry.log_scale.y);
-    }
-
-    #[test]
-    fn what_is_never_seen_and_what_went_bad_goes() {
-        let config = DensityConfig::default();
-        let hidden = Candidate { history: GaussianHistory { best_weight: 0.001, ..good().history }, ..good() };
-        let speck = Candidate { history: GaussianHistory { contribution: 0.5, ..good().history }, ..good() };
-        let new = Candidate { history: GaussianHistory::default(), ..hidden };
-        let nan = shaped(good(), |g| g.mean = Vec3::NAN);
-        let faint = shaped(good(), |g| g.raw_opacity = raw_opacity_from_opacity(0.01));
-        let huge = shaped(good(), |g| g.log_scale = Vec3::splat(4.0));
-        let all = [good(), hidden, new, nan, faint, huge, speck];
-        assert_eq!(plan(&all, 100, &config).keep, [0, 2]);
-        // Without control of density only what went bad goes.
-        let none = DensityConfig { strategy: DensityStrategy::None, ..config };
-        assert_eq!(plan(&all, 100, &none).keep, [0, 1, 2, 6]);
-    }
-
-    #[test]
-    fn no_strategy_grows_a_map_beyond_its_room() {
-        for strategy in [DensityStrategy::MultiView, DensityStrategy::Classic] {
-            let multi_view = MultiViewConfig { max_growth: 1.0, ..MultiViewConfig::default() };
-            let config = DensityConfig { strategy, multi_view, ..DensityConfig::default() };
-            let plan = plan(&[wrong(); 10], 13, &config);
-            assert_eq!((plan.keep.len(), plan.children.len()), (7, 6));
-        }
-    }
-}
+mod tests;

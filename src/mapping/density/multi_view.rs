@@ -1,7 +1,7 @@
 //! Multi-view-consistent densification and pruning (FastGS, arXiv 2511.04283), per keyframe: a Gaussian is divided where several views
-//! agree that it stands in wrong pixels, and goes where no view would miss it.
+//! agree on error pixels within it, and pruned where it contributes to no view.
 //!
-//! Unlike the released code: pruning is decided first and by order of score, without a draw; a pixel is wrong by a multiple of the mean
+//! Unlike the released code: pruning is decided first and by order of score, without a draw; an error pixel exceeds a multiple of the mean
 //! error, not by the view's extremes; ages are per Gaussian.
 
 use super::{Candidate, MultiViewConfig, Verdict};
@@ -9,17 +9,17 @@ use super::{Candidate, MultiViewConfig, Verdict};
 /// Views that must have shown a Gaussian before it can be called useless.
 const MIN_VIEWS: u32 = 3;
 
-pub(super) fn judge(candidates: &[Candidate], config: &MultiViewConfig) -> Vec<Verdict> {
+pub(super) fn decide(candidates: &[Candidate], config: &MultiViewConfig) -> Vec<Verdict> {
     let faint_limit = median_score_of_faint(candidates, config);
     let mut verdicts: Vec<Verdict> =
         candidates.iter().map(|c| if is_useless(c, faint_limit, config) { Verdict::Remove } else { Verdict::Keep }).collect();
-    let mut wrong: Vec<usize> =
-        (0..candidates.len()).filter(|&i| verdicts[i] == Verdict::Keep && is_wrong(&candidates[i], config)).collect();
-    let pixels = |i: &usize| candidates[*i].score.wrong_pixels / candidates[*i].score.views;
-    wrong.sort_by(|a, b| pixels(b).total_cmp(&pixels(a)).then(a.cmp(b)));
+    let mut coarse: Vec<usize> =
+        (0..candidates.len()).filter(|&i| verdicts[i] == Verdict::Keep && is_too_coarse(&candidates[i], config)).collect();
+    let pixels = |i: &usize| candidates[*i].score.error_pixels / candidates[*i].score.views;
+    coarse.sort_by(|a, b| pixels(b).total_cmp(&pixels(a)).then(a.cmp(b)));
     let scored = candidates.iter().filter(|c| c.score.views > 0.0).count();
-    wrong.truncate((config.max_growth * scored as f32) as usize);
-    wrong.into_iter().for_each(|i| verdicts[i] = Verdict::Split);
+    coarse.truncate((config.max_growth * scored as f32) as usize);
+    coarse.into_iter().for_each(|i| verdicts[i] = Verdict::Split);
     verdicts
 }
 
@@ -30,7 +30,7 @@ fn is_faint(c: &Candidate, config: &MultiViewConfig) -> bool {
 /// The pruning score above which a faint Gaussian goes: the median of theirs.
 fn median_score_of_faint(candidates: &[Candidate], config: &MultiViewConfig) -> f32 {
     let faint = candidates.iter().filter(|c| is_faint(c, config));
-    let mut scores: Vec<f32> = faint.map(|c| c.score.weighted_wrong_pixels).collect();
+    let mut scores: Vec<f32> = faint.map(|c| c.score.weighted_error_pixels).collect();
     scores.sort_by(f32::total_cmp);
     scores.get(scores.len() / 2).copied().unwrap_or(f32::INFINITY)
 }
@@ -39,16 +39,16 @@ fn median_score_of_faint(candidates: &[Candidate], config: &MultiViewConfig) -> 
 fn is_useless(c: &Candidate, faint_limit: f32, config: &MultiViewConfig) -> bool {
     let adds_little = c.history.best_weight < config.min_weight || c.history.contribution < config.min_contribution;
     let never_seen_well = c.history.views >= MIN_VIEWS && adds_little;
-    let in_the_way = is_faint(c, config) && c.score.weighted_wrong_pixels > faint_limit;
+    let in_the_way = is_faint(c, config) && c.score.weighted_error_pixels > faint_limit;
     c.history.age >= config.min_age && (never_seen_well || in_the_way)
 }
 
 /// Several views agree that it is too coarse for what they show.
-fn is_wrong(c: &Candidate, config: &MultiViewConfig) -> bool {
+fn is_too_coarse(c: &Candidate, config: &MultiViewConfig) -> bool {
     let views = c.score.views;
     views > 0.0
         && c.history.age >= config.min_age
-        && c.score.wrong_pixels / views > config.wrong_pixels
+        && c.score.error_pixels / views > config.error_pixels
         && c.score.absolute_gradient / views > config.absolute_gradient
         && c.pixels() > config.split_pixels
 }

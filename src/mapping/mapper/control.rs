@@ -3,13 +3,13 @@
 use super::{Mapper, MappingError, Step};
 use crate::mapping::density::{self, Candidate};
 use crate::mapping::{DensityConfig, DensityStrategy};
-use crate::optimise::{AdamConfig, GaussianScore, WrongPixels};
+use crate::optimise::{AdamConfig, ErrorPixels, GaussianScore};
 
 impl Mapper {
     /// Whether, and by what, Gaussians are scored: for control of their density, or to know which to give up.
-    pub(super) fn scoring(&self, density: &DensityConfig) -> Option<WrongPixels> {
+    pub(super) fn scoring(&self, density: &DensityConfig) -> Option<ErrorPixels> {
         let wanted = density.strategy != DensityStrategy::None || self.config.limits.limits_gaussians();
-        wanted.then(|| density.wrong_pixels())
+        wanted.then(|| density.error_pixels())
     }
 
     /// Removes and divides Gaussians by the scores of the steps just taken; returns how many fewer and how many more there are for it.
@@ -36,7 +36,7 @@ impl Mapper {
 
     /// A last step of each of some keyframes of the window, evenly spread over it, that scores the Gaussians; returns their number.
     pub(super) fn score(&mut self, window: &[usize], density: &DensityConfig, adam: &AdamConfig) -> Result<usize, MappingError> {
-        let Some(wrong) = self.scoring(density) else { return Ok(0) };
+        let Some(error_pixels) = self.scoring(density) else { return Ok(0) };
         self.trainer.begin_scores(&self.cloud)?;
         let views = density.views.min(window.len());
         let chosen: Vec<Step> = (0..views)
@@ -46,6 +46,6 @@ impl Mapper {
                 lr_scale: self.config.window.final_lr_scale,
             })
             .collect();
-        Ok(self.steps(&chosen, Some(wrong), adam)?.len())
+        Ok(self.steps(&chosen, Some(error_pixels), adam)?.len())
     }
 }

@@ -135,10 +135,10 @@ mod tests {
                 let depth = 0.7 + 3.0 * random.f64();
                 let point_in_world = truth.inverse() * Point3::from(PINHOLE.unproject(&pixel, depth));
                 let noise = Vector2::new(gauss(&mut random), gauss(&mut random)) * PIXEL_SIGMA;
-                let wrong_pixel = if i % 4 == 0 { Vector2::new(random.f64() * 80.0 + 10.0, -30.0) } else { Vector2::zeros() };
+                let error_pixel = if i % 4 == 0 { Vector2::new(random.f64() * 80.0 + 10.0, -30.0) } else { Vector2::zeros() };
                 let wrong_depth = if i % 5 == 0 { 0.4 } else { 0.0 };
                 let measurement = Measurement {
-                    pixel: pixel + noise + wrong_pixel,
+                    pixel: pixel + noise + error_pixel,
                     inverse_depth: with_depth.then(|| 1.0 / depth + gauss(&mut random) * DEPTH_SIGMA + wrong_depth),
                     pixel_weight: 1.0 / PIXEL_SIGMA,
                     depth_weight: 1.0 / DEPTH_SIGMA,

@@ -10,7 +10,7 @@ use super::{Gaussian64, ImageGradient64, View64};
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Score64 {
     /// Blending weight over high-error pixels.
-    pub wrong_pixels: f64,
+    pub error_pixels: f64,
     /// Blending weight over all pixels.
     pub weight_sum: f64,
     /// Largest blending weight.
@@ -35,7 +35,7 @@ pub fn scores(view: &View64, cloud: &[Gaussian64], by_image: &ImageGradient64, w
         for c in contributions(view, &sorted, x, y).0 {
             let score = &mut found[sorted[c.index].0];
             let weight = c.alpha * c.transmittance;
-            score.wrong_pixels += f64::from(u8::from(wrong[pixel]));
+            score.error_pixels += f64::from(u8::from(wrong[pixel]));
             score.weight_sum += weight;
             score.weight_max = score.weight_max.max(weight);
             score.depth = sorted[c.index].1.depth;
