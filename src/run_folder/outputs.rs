@@ -241,11 +241,10 @@ pub fn evaluate(
     let mut comparison = Comparison::of(input.trajectory, truth.zip(all.as_ref()));
     let is_held_out = |index: usize| config.replay.is_held_out(index);
     let held_out = input.poses.iter().filter(|(index, _)| is_held_out(*index)).count();
-    let picture_every = held_out.div_ceil(MAX_PICTURES).max(1);
     let mut seen = 0;
     let mut picture_error = None;
     let mut on_held_out = |view: ComparedView| {
-        if seen % picture_every == 0 && picture_error.is_none() {
+        if keeps_picture(seen, held_out) && picture_error.is_none() {
             picture_error = write_picture(out, &view).err();
         }
         seen += 1;
@@ -274,6 +273,11 @@ pub fn evaluate(
         },
         images,
     })
+}
+
+/// Whether the `nth` of all held-out views is kept as a picture.
+fn keeps_picture(nth: usize, held_out: usize) -> bool {
+    nth.is_multiple_of(held_out.div_ceil(MAX_PICTURES).max(1))
 }
 
 /// File name of a held-out view in [`VIEWS`].
@@ -358,3 +362,6 @@ pub fn adapter(gpu: &Gpu) -> Adapter {
     let a = gpu.adapter.clone();
     Adapter { name: a.name, backend: a.backend, kind: a.kind, driver: a.driver }
 }
+
+#[cfg(test)]
+mod tests;
