@@ -126,6 +126,15 @@ pub struct TileSamplingConfig {
 }
 
 impl TileSamplingConfig {
+    /// Checks every value.
+    fn validate(&self) -> Result<(), String> {
+        let positive = |value: f32| value.is_finite() && value > 0.0;
+        if !(0.0..=1.0).contains(&self.min_share) || !positive(self.share) || !(positive(self.noise) || self.noise == 0.0) {
+            return Err("min_share must lie between 0 and 1, share must be positive, and noise zero or more".into());
+        }
+        Ok(())
+    }
+
     /// The sampling of each step; `None` if steps use all tiles.
     pub fn sampling(&self) -> Option<TileSampling> {
         let Self { share, min_share, noise } = *self;
@@ -299,7 +308,6 @@ impl MappingConfig {
             ("points.opacity", self.points.opacity),
             ("points.spacing_pixels", self.points.spacing_pixels),
             ("points.footprint", self.points.footprint),
-            ("points.size_range", self.points.size_range),
             ("refine.final_lr_scale_position", self.refine.final_lr_scale_position),
             ("refine.final_lr_scale", self.refine.final_lr_scale),
             ("insertion.depth_disagreement", s.depth_disagreement),
@@ -309,16 +317,12 @@ impl MappingConfig {
             ("insertion.opacity", s.opacity),
             ("insertion.min_depth_metres", s.min_depth_metres),
             ("insertion.max_depth_metres", s.max_depth_metres),
-            ("tile_sampling.share", self.tile_sampling.share),
         ];
         if let Some((name, value)) = positive.iter().find(|(_, value)| !(value.is_finite() && *value > 0.0)) {
             return Err(format!("mapping.{name} must be positive, not {value}"));
         }
-        if !(self.tile_sampling.noise.is_finite() && self.tile_sampling.noise >= 0.0) {
-            return Err(format!("mapping.tile_sampling.noise must be zero or more, not {}", self.tile_sampling.noise));
-        }
-        if self.window.recent == 0 {
-            return Err("mapping.window.recent must be at least 1".into());
+        if self.window.recent == 0 || !(self.points.size_range.is_finite() && self.points.size_range >= 1.0) {
+            return Err("mapping.window.recent and mapping.points.size_range must be at least 1".into());
         }
         self.limits.validate().map_err(|e| format!("mapping.limits: {e}"))?;
         if self.refine.density_every == 0 || self.refine.density_views == 0 {
@@ -327,15 +331,12 @@ impl MappingConfig {
         let closed_shares = [
             ("refine.growth_share", self.refine.growth_share),
             ("refine.half_size_share", self.refine.half_size_share),
-            ("tile_sampling.min_share", self.tile_sampling.min_share),
             ("window.final_lr_scale", self.window.final_lr_scale),
         ];
         if let Some((name, value)) = closed_shares.iter().find(|(_, value)| !(0.0..=1.0).contains(value)) {
             return Err(format!("mapping.{name} must lie between 0 and 1, not {value}"));
         }
-        if self.points.size_range < 1.0 {
-            return Err(format!("mapping.points.size_range must be at least 1, not {}", self.points.size_range));
-        }
+        self.tile_sampling.validate().map_err(|e| format!("mapping.tile_sampling: {e}"))?;
         self.exposure.validate().map_err(|e| format!("mapping.exposure: {e}"))?;
         self.plane_sweep.validate().map_err(|e| format!("mapping.plane_sweep: {e}"))?;
         self.refine_poses.validate().map_err(|e| format!("mapping.refine_poses: {e}"))?;
