@@ -84,7 +84,7 @@ pub(super) fn insertions_allowed(inserted: usize, most: usize) -> usize {
 }
 
 /// The Gaussians to keep so that at most `most` are left: the least useful go, the older first among equals. Ascending.
-pub(super) fn most_useful(histories: &[GaussianHistory], most: usize) -> Vec<u32> {
+pub(super) fn largest_contributions(histories: &[GaussianHistory], most: usize) -> Vec<u32> {
     let mut ranked: Vec<u32> = (0..histories.len() as u32).collect();
     ranked.sort_by(|a, b| histories[*b as usize].contribution.total_cmp(&histories[*a as usize].contribution).then(b.cmp(a)));
     ranked.truncate(most);
@@ -94,7 +94,7 @@ pub(super) fn most_useful(histories: &[GaussianHistory], most: usize) -> Vec<u32
 
 /// The keyframe whose image is missed least: of those that still have one and are not among the `recent` newest, the one between the two
 /// nearest neighbours in time. The first stays, it holds the world.
-pub(super) fn least_missed(keyframes: &[MappedKeyframe], recent: usize) -> Option<usize> {
+pub(super) fn least_needed_keyframe(keyframes: &[MappedKeyframe], recent: usize) -> Option<usize> {
     let with_image: Vec<usize> = (0..keyframes.len().saturating_sub(recent)).filter(|&k| keyframes[k].has_image()).collect();
     // Radians and metres weigh alike: at a metre's distance they move the image alike.
     let apart = |a: usize, b: usize| {
@@ -113,9 +113,9 @@ mod tests {
     fn the_least_useful_go_first() {
         let histories =
             [0.3, 0.0, 2.0, 0.0, 0.1].map(|contribution| GaussianHistory { contribution, ..GaussianHistory::default() });
-        assert_eq!(most_useful(&histories, 4), [0, 2, 3, 4]);
-        assert_eq!(most_useful(&histories, 2), [0, 2]);
-        assert_eq!(most_useful(&histories, 9), [0, 1, 2, 3, 4]);
+        assert_eq!(largest_contributions(&histories, 4), [0, 2, 3, 4]);
+        assert_eq!(largest_contributions(&histories, 2), [0, 2]);
+        assert_eq!(largest_contributions(&histories, 9), [0, 1, 2, 3, 4]);
     }
 
     #[test]

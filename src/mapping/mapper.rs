@@ -275,7 +275,7 @@ impl Mapper {
             let most = self.most_gaussians();
             self.cloud.limit(most);
             new = new.thinned(limits::insertions_allowed(new.len(), most));
-            let keep = limits::most_useful(self.stats.histories(), most - new.len());
+            let keep = limits::largest_contributions(self.stats.histories(), most - new.len());
             let plan = Plan::keeping(keep);
             self.cloud.apply(&self.gpu, &plan)?;
             self.stats.apply(&plan);
@@ -297,7 +297,7 @@ impl Mapper {
         let most = self.keyframes.last().map_or(usize::MAX, |k| self.config.limits.keyframes(k.image_bytes()));
         let mut kept = self.keyframes.iter().filter(|k| k.has_image()).count();
         while kept > most
-            && let Some(k) = limits::least_missed(&self.keyframes, self.config.window.recent)
+            && let Some(k) = limits::least_needed_keyframe(&self.keyframes, self.config.window.recent)
         {
             self.keyframes[k].forget_image();
             kept -= 1;

@@ -8,7 +8,7 @@ use super::keyframe::MappedKeyframe;
 use super::{ScheduleConfig, WindowConfig};
 
 /// So many steps are classified together,
-const JUDGED: usize = 10;
+const CLASSIFIED: usize = 10;
 /// and so many of them must be of views seen before in the same session, or their gain says nothing.
 const MIN_REPEATED: usize = 4;
 
@@ -32,7 +32,7 @@ pub(super) struct Session {
     converged: bool,
     /// The loss of each view at its last step of this session.
     losses: BTreeMap<usize, f32>,
-    /// Since the last judgement.
+    /// Since the last classification.
     gain: Gain,
 }
 
@@ -110,7 +110,7 @@ impl Session {
                 self.gain.after += loss;
             }
         }
-        if self.gain.steps >= JUDGED {
+        if self.gain.steps >= CLASSIFIED {
             let Gain { repeated, before, after, .. } = std::mem::take(&mut self.gain);
             self.converged = min_gain > 0.0 && repeated >= MIN_REPEATED && before - after < min_gain * before;
         }

@@ -1,15 +1,15 @@
 //! Density control of 3DGS (Kerbl et al. 2023), for comparison: what has a large mean gradient is divided, whatever it costs.
 
-use super::{Candidate, ClassicConfig, Verdict};
+use super::{Candidate, ClassicConfig, Decision};
 
-pub(super) fn decide(candidates: &[Candidate], config: &ClassicConfig) -> Vec<Verdict> {
+pub(super) fn decide(candidates: &[Candidate], config: &ClassicConfig) -> Vec<Decision> {
     let decide = |c: &Candidate| {
         if c.score.views == 0.0 || c.score.gradient / c.score.views < config.gradient {
-            Verdict::Keep
+            Decision::Keep
         } else if c.pixels() > config.split_pixels {
-            Verdict::Split
+            Decision::Split
         } else {
-            Verdict::Clone
+            Decision::Clone
         }
     };
     candidates.iter().map(decide).collect()

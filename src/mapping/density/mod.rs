@@ -24,7 +24,7 @@ pub(super) struct Candidate {
 
 /// Decision of a density strategy for one Gaussian.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Verdict {
+pub(super) enum Decision {
     Keep,
     Remove,
     /// Two smaller ones in its place, along its longest axis.
@@ -51,25 +51,25 @@ impl Candidate {
 
 /// Decides on every Gaussian; those with a NaN are removed whatever the strategy. At most `most` are left, undivided ones first.
 pub(super) fn plan(candidates: &[Candidate], most: usize, config: &DensityConfig) -> Plan {
-    let verdicts = match config.strategy {
+    let decisions = match config.strategy {
         DensityStrategy::MultiView => multi_view::decide(candidates, &config.multi_view),
         DensityStrategy::Classic => classic::decide(candidates, &config.classic),
-        DensityStrategy::None => vec![Verdict::Keep; candidates.len()],
+        DensityStrategy::None => vec![Decision::Keep; candidates.len()],
     };
     let mut plan = Plan::default();
-    let mut room = most.saturating_sub(candidates.len());
-    for (i, (candidate, verdict)) in (0..).zip(candidates.iter().zip(verdicts)) {
+    let mut capacity = most.saturating_sub(candidates.len());
+    for (i, (candidate, decision)) in (0..).zip(candidates.iter().zip(decisions)) {
         let valid = candidate.is_finite()
             && candidate.opacity() >= config.min_opacity
             && candidate.geometry.log_scale.max_element() <= config.max_scale_metres.ln();
-        match verdict {
+        match decision {
             _ if !valid => {}
-            Verdict::Remove => {}
-            Verdict::Split | Verdict::Clone if room > 0 => {
-                plan.children.extend(divide(i, candidate, verdict == Verdict::Clone));
-                room -= 1;
+            Decision::Remove => {}
+            Decision::Split | Decision::Clone if capacity > 0 => {
+                plan.children.extend(divide(i, candidate, decision == Decision::Clone));
+                capacity -= 1;
             }
-            Verdict::Keep | Verdict::Split | Verdict::Clone => plan.keep.push(i),
+            Decision::Keep | Decision::Split | Decision::Clone => plan.keep.push(i),
         }
     }
     plan

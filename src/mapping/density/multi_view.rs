@@ -4,23 +4,23 @@
 //! Unlike the released code: pruning is decided first and by order of score, without a draw; an error pixel exceeds a multiple of the mean
 //! error, not by the view's extremes; ages are per Gaussian.
 
-use super::{Candidate, MultiViewConfig, Verdict};
+use super::{Candidate, Decision, MultiViewConfig};
 
 /// Views that must have shown a Gaussian before it can be called useless.
 const MIN_VIEWS: u32 = 3;
 
-pub(super) fn decide(candidates: &[Candidate], config: &MultiViewConfig) -> Vec<Verdict> {
+pub(super) fn decide(candidates: &[Candidate], config: &MultiViewConfig) -> Vec<Decision> {
     let faint_limit = median_score_of_faint(candidates, config);
-    let mut verdicts: Vec<Verdict> =
-        candidates.iter().map(|c| if is_useless(c, faint_limit, config) { Verdict::Remove } else { Verdict::Keep }).collect();
+    let mut decisions: Vec<Decision> =
+        candidates.iter().map(|c| if is_useless(c, faint_limit, config) { Decision::Remove } else { Decision::Keep }).collect();
     let mut coarse: Vec<usize> =
-        (0..candidates.len()).filter(|&i| verdicts[i] == Verdict::Keep && is_too_coarse(&candidates[i], config)).collect();
+        (0..candidates.len()).filter(|&i| decisions[i] == Decision::Keep && is_too_coarse(&candidates[i], config)).collect();
     let pixels = |i: &usize| candidates[*i].score.error_pixels / candidates[*i].score.views;
     coarse.sort_by(|a, b| pixels(b).total_cmp(&pixels(a)).then(a.cmp(b)));
     let scored = candidates.iter().filter(|c| c.score.views > 0.0).count();
     coarse.truncate((config.max_growth * scored as f32) as usize);
-    coarse.into_iter().for_each(|i| verdicts[i] = Verdict::Split);
-    verdicts
+    coarse.into_iter().for_each(|i| decisions[i] = Decision::Split);
+    decisions
 }
 
 fn is_faint(c: &Candidate, config: &MultiViewConfig) -> bool {

@@ -87,11 +87,11 @@ fn classic_control_follows_the_mean_gradient_and_the_size() {
     let with = |views: f32, gradient: f32| scored(GaussianScore { views, gradient, ..GaussianScore::default() });
     let unseen = with(0.0, 1.0);
     // Means of 0.15 (a sum above the threshold), 0.25 and 0.5; the disc of 10 cm is 20 pixels wide.
-    let verdicts = classic::decide(&[unseen, with(2.0, 0.3), with(2.0, 0.5), with(2.0, 1.0)], &config);
-    assert_eq!(verdicts, [Verdict::Keep, Verdict::Keep, Verdict::Split, Verdict::Split]);
+    let decisions = classic::decide(&[unseen, with(2.0, 0.3), with(2.0, 0.5), with(2.0, 1.0)], &config);
+    assert_eq!(decisions, [Decision::Keep, Decision::Keep, Decision::Split, Decision::Split]);
     let pixels = with(2.0, 1.0).pixels();
     let at = |split_pixels: f32| classic::decide(&[with(2.0, 1.0)], &ClassicConfig { split_pixels, ..config.clone() })[0];
-    assert_eq!((at(pixels * 0.99), at(pixels), at(pixels * 1.01)), (Verdict::Split, Verdict::Clone, Verdict::Clone));
+    assert_eq!((at(pixels * 0.99), at(pixels), at(pixels * 1.01)), (Decision::Split, Decision::Clone, Decision::Clone));
 }
 
 #[test]
@@ -101,8 +101,8 @@ fn those_with_most_error_pixels_a_view_are_split_up_to_the_share() {
         scored(GaussianScore { views, error_pixels, absolute_gradient: 1.0, ..GaussianScore::default() })
     };
     // 10 and 12 error pixels a view; the unseen ones count for no share.
-    let verdicts = multi_view::decide(&[with(6.0, 60.0), with(3.0, 36.0), with(0.0, 0.0), with(0.0, 0.0)], &config);
-    assert_eq!(verdicts, [Verdict::Keep, Verdict::Split, Verdict::Keep, Verdict::Keep]);
+    let decisions = multi_view::decide(&[with(6.0, 60.0), with(3.0, 36.0), with(0.0, 0.0), with(0.0, 0.0)], &config);
+    assert_eq!(decisions, [Decision::Keep, Decision::Split, Decision::Keep, Decision::Keep]);
 }
 
 #[test]
@@ -125,13 +125,13 @@ fn the_worse_half_of_the_faint_is_pruned() {
         with(0.05, 1.0, old - 1, 9.0),
         with(0.05, 1.0, old - 1, 0.0),
     ];
-    let verdicts = multi_view::decide(&[&faint[..], &others].concat(), &config);
-    let removed: Vec<usize> = (0..verdicts.len()).filter(|i| verdicts[*i] == Verdict::Remove).collect();
+    let decisions = multi_view::decide(&[&faint[..], &others].concat(), &config);
+    let removed: Vec<usize> = (0..decisions.len()).filter(|i| decisions[*i] == Decision::Remove).collect();
     assert_eq!(removed, [2]);
     // High scores alone do not move the median either.
     let high: Vec<Candidate> = others.into_iter().step_by(2).collect();
-    let verdicts = multi_view::decide(&[&faint[..], &high].concat(), &config);
-    assert_eq!(verdicts.iter().filter(|v| **v == Verdict::Remove).count(), 1);
+    let decisions = multi_view::decide(&[&faint[..], &high].concat(), &config);
+    assert_eq!(decisions.iter().filter(|v| **v == Decision::Remove).count(), 1);
 }
 
 #[test]

@@ -161,7 +161,7 @@ fn make_problem(
         if let (Some(a), Some(b)) = (place[m.keyframe], place[m.relative_to])
             && a.min(b) < free_poses
         {
-            problem.relative.push(RelativePose { edge: m.edge(a, b), believed: true });
+            problem.relative.push(RelativePose { edge: m.edge(a, b), is_inlier: true });
         }
     }
     let mut observations = Vec::new();

@@ -102,7 +102,7 @@ impl Context<'_> {
     pub fn against_view(&self, frame: &FrameFeatures, view: &View) -> Option<Localised> {
         let rough = pose_from_view(&view.features.features, &view.points, frame, &self.rig.pinhole)?;
         let pairs: Vec<(usize, usize)> = rough.matches.iter().map(|m| (m.query, m.feature)).collect();
-        let mut found = self.settle(frame, &rough.camera_from_world, &pairs, |i| view.points[i], |i| view.landmarks[i]);
+        let mut found = self.optimise_over(frame, &rough.camera_from_world, &pairs, |i| view.points[i], |i| view.landmarks[i]);
         if found.inliers >= ROUGH_INLIERS {
             let (guided, _) = self.search(frame, view, &found.camera_from_world, MOTION_RADII[1]);
             found = if guided.inliers > found.inliers { guided } else { found };
@@ -165,7 +165,8 @@ impl Context<'_> {
         let search = ProjectionSearch { taken: &taken, coarser_octaves: 0, rules: MAP_RULES };
         let found = search.run(frame, &visible, radius, self.rig);
         pairs.extend(found.iter().map(|m| (m.point, m.feature)));
-        let mut found = self.settle(frame, &start.camera_from_world, &pairs, |l| Some(self.map.landmarks[l].position), Some);
+        let mut found =
+            self.optimise_over(frame, &start.camera_from_world, &pairs, |l| Some(self.map.landmarks[l].position), Some);
         found.rough = start.rough;
         for l in found.landmarks.iter().flatten() {
             self.map.landmarks[*l].observed += 1;
@@ -192,7 +193,7 @@ impl Context<'_> {
     }
 
     /// Optimises a pose over pairs (source that `known` knows the point of, feature) and keeps the landmarks that agree.
-    fn settle(
+    fn optimise_over(
         &self,
         frame: &FrameFeatures,
         initial: &Se3,
@@ -210,8 +211,8 @@ impl Context<'_> {
             .collect();
         let observations: Vec<PoseObservation> = usable.iter().map(|u| u.2).collect();
         let estimate = optimise_pose(&self.rig.pinhole, initial, &observations);
-        for ((source, feature, _), trust) in usable.iter().zip(&estimate.classes) {
-            if *trust != InlierClass::Outlier {
+        for ((source, feature, _), class) in usable.iter().zip(&estimate.classes) {
+            if *class != InlierClass::Outlier {
                 landmarks[*feature] = landmark_of(*source);
             }
         }
@@ -225,7 +226,7 @@ impl Context<'_> {
         }
     }
 
-    /// Looks for a view's points around where `pose` shows them, and settles the pose; also returns the number of matches.
+    /// Looks for a view's points around where `pose` shows them, and optimises the pose; also returns the number of matches.
     fn search(&self, frame: &FrameFeatures, view: &View, pose: &Se3, radius: f64) -> (Localised, usize) {
         let pinhole = &self.rig.pinhole;
         let project = |(index, (feature, point)): (usize, (&Feature, &Option<Point3<f64>>))| {
@@ -244,7 +245,7 @@ impl Context<'_> {
             view.features.features.iter().zip(&view.points).enumerate().filter_map(project).collect();
         let matches = MOTION_SEARCH.run(frame, &projections, |_| radius, self.rig);
         let pairs: Vec<(usize, usize)> = matches.iter().map(|m| (m.point, m.feature)).collect();
-        (self.settle(frame, pose, &pairs, |i| view.points[i], |i| view.landmarks[i]), matches.len())
+        (self.optimise_over(frame, pose, &pairs, |i| view.points[i], |i| view.landmarks[i]), matches.len())
     }
 
     fn local_landmarks(&self, start: &Localised, reference: usize) -> Vec<usize> {

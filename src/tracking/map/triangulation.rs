@@ -160,8 +160,8 @@ struct Observed<'a> {
 fn agree(point: &Point3<f64>, a: &Observed<'_>, b: &Observed<'_>, rig: &Rig) -> bool {
     let Rig { pinhole, config } = rig;
     let projects = |Observed { feature, keyframe }: &Observed<'_>| {
-        let trust = feature.measurement(config).classify(pinhole, &(keyframe.camera_from_world * point).coords);
-        trust == InlierClass::Full || (trust == InlierClass::PixelOnly && feature.depth_metres.is_none())
+        let class = feature.measurement(config).classify(pinhole, &(keyframe.camera_from_world * point).coords);
+        class == InlierClass::Full || (class == InlierClass::PixelOnly && feature.depth_metres.is_none())
     };
     let size = |Observed { feature, keyframe }: &Observed<'_>| {
         (point - keyframe.centre()).norm() / config.pyramid_scale.powi(feature.octave.into())

@@ -31,7 +31,7 @@ pub struct BundleObservation {
 pub struct RelativePose {
     /// Between rigid poses; its seventh weight is not used.
     pub edge: Edge,
-    pub believed: bool,
+    pub is_inlier: bool,
 }
 
 /// Bundle adjustment problem.
@@ -111,7 +111,7 @@ impl BundleProblem {
             o.class = o.measurement.classify(pinhole, &(self.poses[o.pose] * self.points[o.point]).coords);
         }
         for r in &mut self.relative {
-            r.believed = passes_gate(&r.edge, &self.poses[r.edge.a], &self.poses[r.edge.b]);
+            r.is_inlier = passes_gate(&r.edge, &self.poses[r.edge.a], &self.poses[r.edge.b]);
         }
     }
 
@@ -122,8 +122,8 @@ impl BundleProblem {
 
     /// The robust cost of all trusted observations. Infinite if a point lies behind a camera that sees it, so that no step goes there.
     pub fn cost(&self, pinhole: &Pinhole) -> f64 {
-        let believed = self.relative.iter().filter(|r| r.believed);
-        let mut sum: f64 = believed.map(|r| r.edge.robust(self.off(&r.edge)).0).sum();
+        let inliers = self.relative.iter().filter(|r| r.is_inlier);
+        let mut sum: f64 = inliers.map(|r| r.edge.robust(self.off(&r.edge)).0).sum();
         for o in &self.observations {
             let Some(measurement) = o.measurement.restricted_to(o.class) else { continue };
             match measurement.residual(pinhole, &(self.poses[o.pose] * self.points[o.point]).coords) {
@@ -167,7 +167,7 @@ impl BundleProblem {
     }
 
     fn linearise_relative(&self, system: &mut System) {
-        for RelativePose { edge, .. } in self.relative.iter().filter(|r| r.believed) {
+        for RelativePose { edge, .. } in self.relative.iter().filter(|r| r.is_inlier) {
             let Linearised { residual, by_a, by_b } =
                 edge.linearise(&Sim3::from(self.poses[edge.a]), &Sim3::from(self.poses[edge.b]));
             let weight = edge.robust(residual.norm_squared()).1;

@@ -52,7 +52,7 @@ fn measured(problem: &BundleProblem, a: usize, b: usize, error: Se3) -> Relative
         sigma_translation_metres: 0.001,
         sigma_rotation_rad: 0.001,
     };
-    RelativePose { edge: measurement.edge(a, b), believed: true }
+    RelativePose { edge: measurement.edge(a, b), is_inlier: true }
 }
 
 fn settle(problem: &mut BundleProblem) {
@@ -146,7 +146,7 @@ proptest! {
             sigma_rotation_rad: sigmas[1],
         }.edge(1, 0);
         let edge = Edge { huber: None, ..edge };
-        let relative = vec![RelativePose { edge, believed: true }];
+        let relative = vec![RelativePose { edge, is_inlier: true }];
         let problem = BundleProblem { poses: vec![b, a], free_poses: 2, relative, ..Default::default() };
         let system = problem.linearise(&PINHOLE);
         // Columns: the steps of both poses.
@@ -183,7 +183,7 @@ fn a_wildly_wrong_relative_pose_does_not_move_what_landmarks_hold() {
     }
     settle(&mut without);
     settle(&mut with);
-    assert!(with.relative.iter().all(|r| !r.believed));
+    assert!(with.relative.iter().all(|r| !r.is_inlier));
     for (a, b) in with.poses.iter().zip(&without.poses) {
         let apart = a * b.inverse();
         assert!(apart.translation.vector.norm() < 1e-3 && apart.rotation.angle() < 1e-3, "{apart}");
@@ -199,5 +199,5 @@ fn a_good_relative_pose_helps_what_few_landmarks_hold() {
     settle(&mut without);
     settle(&mut with);
     let off = |problem: &BundleProblem| se3::log(&(problem.poses[0] * truth.poses[0].inverse())).norm();
-    assert!(with.relative[0].believed && off(&with) < 0.4 * off(&without), "{} → {}", off(&without), off(&with));
+    assert!(with.relative[0].is_inlier && off(&with) < 0.4 * off(&without), "{} → {}", off(&without), off(&with));
 }

@@ -1,7 +1,7 @@
 //! The relative pose of two views by least squares on their matches' distances from the epipolar lines.
 //!
-//! What RANSAC finds fits five matches exactly and all others by chance: nine standard deviations off in the median (`docs/stress.md`). Here all inliers have
-//! their say (Hartley & Zisserman, *Multiple View Geometry*, 2nd ed., sec. 11.4.3: Sampson's distance; Levenberg-Marquardt, Huber weights).
+//! What RANSAC finds fits five matches exactly and all others by chance: nine standard deviations off in the median (`docs/stress.md`). Here the pose is refined over
+//! all inliers (Hartley & Zisserman, *Multiple View Geometry*, 2nd ed., sec. 11.4.3: Sampson's distance; Levenberg-Marquardt, Huber weights).
 
 use nalgebra::{Matrix2x3, Matrix3, Matrix5, Translation3, UnitQuaternion, Vector2, Vector3, Vector5};
 
@@ -10,7 +10,7 @@ use crate::geometry::{Pinhole, Se3};
 use crate::tracking::solvers::residual::huber;
 
 /// Distance from which on a match pulls less and less, pixels.
-const DOUBT_PIXELS: f64 = 1.0;
+const HUBER_PIXELS: f64 = 1.0;
 const MAX_ROUNDS: usize = 30;
 /// Steps shorter than this change nothing, radians.
 const SHORT: f64 = 1e-9;
@@ -101,7 +101,7 @@ impl System {
                 let length_by = (line_b.dot(&there.xy()) + line_a.dot(&back.xy())) / length;
                 (b.dot(&there) - distance * length_by) / length
             });
-            let (cost, weight) = huber(distance * distance, DOUBT_PIXELS * DOUBT_PIXELS);
+            let (cost, weight) = huber(distance * distance, HUBER_PIXELS * HUBER_PIXELS);
             system.hessian += weight * jacobian * jacobian.transpose();
             system.gradient += weight * distance * jacobian;
             system.cost += cost;

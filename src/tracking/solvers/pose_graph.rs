@@ -261,10 +261,10 @@ mod tests {
         graph.edges.push(Edge { huber: Some(1.0), ..edge(0, 30, wrong * truth[0] * truth[30].inverse()) });
         graph.edges.push(edge(0, STATIONS - 1, truth[0] * truth[STATIONS - 1].inverse()));
         graph.optimise(50);
-        let doubted = off_metres(&graph, &truth);
+        let robust_off = off_metres(&graph, &truth);
         graph.edges[STATIONS - 1].huber = None;
         graph.optimise(50);
-        assert!(doubted < 0.25 && off_metres(&graph, &truth) > 0.8, "{doubted} m");
+        assert!(robust_off < 0.25 && off_metres(&graph, &truth) > 0.8, "{robust_off} m");
         let mut loose = PoseGraph { poses: truth[..3].to_vec(), ..Default::default() };
         assert_eq!(loose.optimise(3), (0.0, 0.0));
         loose.edges.push(edge(0, 1, Sim3::identity()));

@@ -44,15 +44,15 @@ pub fn align_pairs(pairs: &[Pair], pinhole: &Pinhole, scale_is_free: bool) -> Op
     let mut a_from_b = draw_best(pairs, pinhole, scale_is_free)?;
     let pairs: Vec<Pair> = pairs.iter().map(|pair| if scale_is_free { pair.with_known_distances() } else { *pair }).collect();
     for _ in 0..ROUNDS {
-        let trusts: Vec<[InlierClass; 2]> = pairs.iter().map(|pair| pair.classify(pinhole, &a_from_b)).collect();
-        a_from_b = refine(&pairs, &trusts, pinhole, &a_from_b, scale_is_free);
+        let classes: Vec<[InlierClass; 2]> = pairs.iter().map(|pair| pair.classify(pinhole, &a_from_b)).collect();
+        a_from_b = refine(&pairs, &classes, pinhole, &a_from_b, scale_is_free);
     }
     let inliers = pairs.iter().filter(|pair| agrees(&pair.classify(pinhole, &a_from_b))).count();
     (inliers >= MIN_INLIERS).then_some(a_from_b)
 }
 
-fn agrees(trusts: &[InlierClass; 2]) -> bool {
-    trusts.iter().all(|t| *t != InlierClass::Outlier)
+fn agrees(classes: &[InlierClass; 2]) -> bool {
+    classes.iter().all(|t| *t != InlierClass::Outlier)
 }
 
 /// RANSAC: the motion from three pairs with which most of the others agree.
@@ -81,8 +81,8 @@ fn draw_best(pairs: &[Pair], pinhole: &Pinhole, scale_is_free: bool) -> Option<S
 }
 
 /// Levenberg-Marquardt over the trusted measurements of pairs that agree in both images.
-fn refine(pairs: &[Pair], trusts: &[[InlierClass; 2]], pinhole: &Pinhole, initial: &Sim3, scale_is_free: bool) -> Sim3 {
-    let used: Vec<(&Pair, &[InlierClass; 2])> = pairs.iter().zip(trusts).filter(|(_, t)| agrees(t)).collect();
+fn refine(pairs: &[Pair], classes: &[[InlierClass; 2]], pinhole: &Pinhole, initial: &Sim3, scale_is_free: bool) -> Sim3 {
+    let used: Vec<(&Pair, &[InlierClass; 2])> = pairs.iter().zip(classes).filter(|(_, t)| agrees(t)).collect();
     let mut a_from_b = *initial;
     let (mut hessian, mut gradient, mut cost) = normal_equations(&used, pinhole, &a_from_b);
     let mut lambda = 1e-4;
@@ -111,10 +111,10 @@ fn refine(pairs: &[Pair], trusts: &[[InlierClass; 2]], pinhole: &Pinhole, initia
 /// Hessian, gradient and robust cost; infinite if a point falls behind a camera.
 fn normal_equations(used: &[(&Pair, &[InlierClass; 2])], pinhole: &Pinhole, a_from_b: &Sim3) -> (Matrix7, Vector7, f64) {
     let (mut hessian, mut gradient, mut cost) = (Matrix7::zeros(), Vector7::zeros(), 0.0);
-    for (pair, trusts) in used {
-        for (term, trust) in pair.linearise(pinhole, a_from_b, trusts).into_iter().zip(*trusts) {
+    for (pair, classes) in used {
+        for (term, class) in pair.linearise(pinhole, a_from_b, classes).into_iter().zip(*classes) {
             let Some((residual, by_step)) = term else {
-                cost += if *trust == InlierClass::Outlier { 0.0 } else { f64::INFINITY };
+                cost += if *class == InlierClass::Outlier { 0.0 } else { f64::INFINITY };
                 continue;
             };
             let (rho, weights) = Measurement::robust(&residual);
@@ -155,15 +155,20 @@ impl Pair {
     }
 
     /// Residuals in a's and b's image, and their derivatives by a left perturbation of `a_from_b`.
-    fn linearise(&self, pinhole: &Pinhole, a_from_b: &Sim3, trusts: &[InlierClass; 2]) -> [Option<(Vector3<f64>, Matrix3x7)>; 2] {
+    fn linearise(
+        &self,
+        pinhole: &Pinhole,
+        a_from_b: &Sim3,
+        classes: &[InlierClass; 2],
+    ) -> [Option<(Vector3<f64>, Matrix3x7)>; 2] {
         let in_a = || {
-            let (measurement, p) = (self.in_a.restricted_to(trusts[0])?, a_from_b.act(&self.p_in_b).coords);
+            let (measurement, p) = (self.in_a.restricted_to(classes[0])?, a_from_b.act(&self.p_in_b).coords);
             let residual = measurement.residual(pinhole, &p)?;
             Some((residual, measurement.jacobian(pinhole, &p) * point_by_similarity(&p)))
         };
         let in_b = || {
             let inverse = a_from_b.inverse();
-            let (measurement, p) = (self.in_b.restricted_to(trusts[1])?, inverse.act(&self.p_in_a).coords);
+            let (measurement, p) = (self.in_b.restricted_to(classes[1])?, inverse.act(&self.p_in_a).coords);
             let residual = measurement.residual(pinhole, &p)?;
             let turned = inverse.rotation.to_rotation_matrix().matrix() * inverse.scale;
             let by_step = turned * -point_by_similarity(&self.p_in_a.coords);

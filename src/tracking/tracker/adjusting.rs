@@ -104,7 +104,7 @@ impl Tracker {
     }
 
     /// Before a keyframe is created: deterministic replay waits for the previous adjustment, real time never.
-    pub(super) fn settle_for_keyframe(&mut self, times: &mut StageTimes) -> Result<(), TrackingError> {
+    pub(super) fn finish_adjustment_before_keyframe(&mut self, times: &mut StageTimes) -> Result<(), TrackingError> {
         if self.adjusting.real_time { Ok(()) } else { self.take_all_adjusted(times) }
     }
 

@@ -308,7 +308,7 @@ impl Tracker {
 
     /// Makes the frame that was just tracked a keyframe. `held`: by landmarks, instead of by all pixels.
     fn make_keyframe(&mut self, frame: &Frame, held: bool, times: &mut StageTimes) -> Result<Option<NewKeyframe>, TrackingError> {
-        self.settle_for_keyframe(times)?;
+        self.finish_adjustment_before_keyframe(times)?;
         let Some(LastFrame { features, camera_from_world, landmarks }) = self.motion.last.take() else { return Ok(None) };
         let clock = Instant::now();
         let keyframe = Keyframe {
