@@ -21,11 +21,13 @@ pub enum Preset {
     Balanced,
     /// More steps, denser insertion, and all tiles in every step.
     Quality,
+    /// Few steps a keyframe, and consolidation over all keyframes: online sessions, and 150 epochs at the end.
+    Best,
 }
 
 impl Preset {
     /// All presets, the fastest one first.
-    pub const ALL: [Self; 3] = [Self::Realtime, Self::Balanced, Self::Quality];
+    pub const ALL: [Self; 4] = [Self::Realtime, Self::Balanced, Self::Quality, Self::Best];
 
     /// Sets the values in which the preset differs from the defaults.
     pub fn apply(self, config: &mut Config) {
@@ -52,6 +54,15 @@ impl Preset {
                 mapping.tile_sampling.min_share = 1.0;
                 mapping.insertion.detail = 0.04;
                 mapping.density.multi_view.min_contribution = 0.5;
+            }
+            // A step on a complete set of views gains more than one whose successors undo it: insertion and exposure need few.
+            Self::Best => {
+                mapping.iterations_per_keyframe = 10;
+                mapping.refine.growth = 1.0;
+                mapping.refine.session_epochs = 3;
+                mapping.refine.final_epochs = 150;
+                mapping.refine.half_size_share = 0.0;
+                mapping.refine.all_tiles = true;
             }
         }
     }
@@ -104,6 +115,7 @@ mod tests {
             config
         };
         assert_eq!(of(Preset::Balanced), Config::default());
+        assert!(of(Preset::Best).mapping.refine.final_epochs > 0);
         let (realtime, quality) = (of(Preset::Realtime), of(Preset::Quality));
         assert!(realtime.replay.real_time && realtime.mapping.yields_to_keyframes);
         assert!(

@@ -215,12 +215,21 @@ impl Default for PointsConfig {
     }
 }
 
-/// The refinement over all keyframes after the last one.
+/// Consolidation: seeded, shuffled epochs over all keyframes with images, in online sessions and after the last keyframe.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RefineConfig {
-    /// Steps, one view each; 0 leaves the map as it is after the last keyframe.
+    /// An online session follows a keyframe once their number has grown by this share since the last session; 0: none. The sessions' total
+    /// cost is linear in the number of keyframes.
+    pub growth: f32,
+    /// Epochs of an online session: steps of each keyframe.
+    pub session_epochs: usize,
+    /// Epochs after the last keyframe.
+    pub final_epochs: usize,
+    /// Least steps after the last keyframe, one view each, whatever the number of keyframes. Without steps and epochs the map stays as it is.
     pub steps: usize,
+    /// Whether steps of consolidation use all tiles instead of sampling them.
+    pub all_tiles: bool,
     /// Density is controlled each time after so many steps,
     pub density_every: usize,
     /// by the scores of so many keyframes, evenly spread over all.
@@ -238,7 +247,11 @@ pub struct RefineConfig {
 impl Default for RefineConfig {
     fn default() -> Self {
         Self {
+            growth: 0.0,
+            session_epochs: 0,
+            final_epochs: 0,
             steps: 0,
+            all_tiles: false,
             density_every: 200,
             density_views: 10,
             growth_share: 0.65,
@@ -278,7 +291,8 @@ impl MappingConfig {
 
     /// Whether any step may be taken at half the size.
     pub fn learns_at_half_size(&self) -> bool {
-        self.schedule.coarse_share > 0.0 || (self.refine.steps > 0 && self.refine.half_size_share > 0.0)
+        self.schedule.coarse_share > 0.0
+            || (self.refine.steps.max(self.refine.final_epochs) > 0 && self.refine.half_size_share > 0.0)
     }
 
     /// Checks every value.
@@ -325,6 +339,9 @@ impl MappingConfig {
             return Err("mapping.window.recent and mapping.points.size_range must be at least 1".into());
         }
         self.limits.validate().map_err(|e| format!("mapping.limits: {e}"))?;
+        if !(self.refine.growth.is_finite() && self.refine.growth >= 0.0) {
+            return Err(format!("mapping.refine.growth must be zero or more, not {}", self.refine.growth));
+        }
         if self.refine.density_every == 0 || self.refine.density_views == 0 {
             return Err("mapping.refine.density_every and mapping.refine.density_views must be at least 1".into());
         }

@@ -25,7 +25,7 @@ use super::schedule::{self, Session, Step};
 use super::{Keyframe, KeyframeId, LimitsConfig, MappingConfig, exposure, initialise_from_points, insertion, limits};
 use crate::geometry::Se3;
 use crate::gpu::{Gpu, GpuError};
-use crate::optimise::{AdamConfig, ErrorPixels, StepReport, Trainer, TrainingView};
+use crate::optimise::{AdamConfig, ErrorPixels, StepReport, TileSampling, Trainer, TrainingView};
 use crate::render::{GpuCloud, Plan, Rendered};
 use crate::sequence::{KnownPoint, RectifiedImage};
 use crate::splat::{Exposure, GaussianCloud, ViewCamera};
@@ -97,6 +97,8 @@ pub struct Mapper {
     keyframes: Vec<MappedKeyframe>,
     rng: Rng,
     step_times: Vec<Duration>,
+    /// Keyframes with images at the last online session of consolidation.
+    consolidated: usize,
 }
 
 impl Mapper {
@@ -113,6 +115,7 @@ impl Mapper {
             keyframes: Vec::new(),
             rng: Rng::with_seed(config.seed),
             step_times: Vec::new(),
+            consolidated: 0,
             gpu,
         })
     }
@@ -149,7 +152,8 @@ impl Mapper {
             });
         }
         let report = self.optimise(iterations, stop)?;
-        Ok(KeyframeReport { id: keyframe.id, inserted, gaussians: self.cloud.len(), exposure, ..report })
+        let iterations = report.iterations + self.consolidate(stop)?;
+        Ok(KeyframeReport { id: keyframe.id, inserted, iterations, gaussians: self.cloud.len(), exposure, ..report })
     }
 
     /// Takes in points of the scene that are known before any keyframe, in the keyframes' world; `anchor` is the first of these.
@@ -337,7 +341,7 @@ impl Mapper {
             let count = most.min(end - session.taken());
             let batch = session.next(count, &self.keyframes, &mut self.rng, &self.config.window, &self.config.schedule);
             let adam = &self.config.clone().adam;
-            let reports = self.steps(&batch, None, adam)?;
+            let reports = self.steps(&batch, None, self.tile_sampling(), adam)?;
             self.refine_poses(session.window(), &batch, &reports);
             psnr_sum += reports.iter().map(|r| r.loss.psnr_db()).sum::<f32>();
             done += batch.len();
@@ -356,9 +360,18 @@ impl Mapper {
         }
     }
 
-    fn steps(&mut self, batch: &[Step], scored: Option<ErrorPixels>, adam: &AdamConfig) -> Result<Vec<StepReport>, MappingError> {
-        // A pose is refined by its whole image.
-        let tile_sampling = self.config.tile_sampling.sampling().filter(|_| !self.config.refine_poses.enabled);
+    /// Tile sampling of online steps; `None` for all tiles. A pose is refined by its whole image.
+    fn tile_sampling(&self) -> Option<TileSampling> {
+        self.config.tile_sampling.sampling().filter(|_| !self.config.refine_poses.enabled)
+    }
+
+    fn steps(
+        &mut self,
+        batch: &[Step],
+        scored: Option<ErrorPixels>,
+        tile_sampling: Option<TileSampling>,
+        adam: &AdamConfig,
+    ) -> Result<Vec<StepReport>, MappingError> {
         let view = |step: &Step| {
             let keyframe = &self.keyframes[step.keyframe];
             let view = keyframe.view(step.coarse).expect("only keyframes with images are drawn");

@@ -87,3 +87,50 @@ fn keyframes_before_the_first_depth_are_passed_over() {
     let after = mapper.insert(&keyframe(4, false), &|| false).unwrap();
     assert!(after.inserted == 0 && after.iterations > 0 && after.gaussians > 0, "{after:?}");
 }
+
+/// Sessions of consolidation come at 8, 16 and 32 keyframes when their number has to double, and only where images are left.
+#[test]
+fn online_sessions_follow_the_growth_of_the_keyframes() {
+    let Some(gpu) = adapter() else { return };
+    let mut config = MappingConfig { first_iterations: 5, iterations_per_keyframe: 5, ..Default::default() };
+    (config.refine.growth, config.refine.session_epochs, config.refine.all_tiles) = (1.0, 2, true);
+    let steps = |config: &MappingConfig, mapper: &mut Mapper, ids: std::ops::Range<usize>| -> Vec<usize> {
+        ids.map(|id| mapper.insert(&keyframe(id, true), &|| false).unwrap().iterations - config.iterations_per_keyframe).collect()
+    };
+    let sessions =
+        |steps: &[usize]| -> Vec<(usize, usize)> { (0..).zip(steps.iter().copied()).filter(|(_, s)| *s > 0).collect() };
+    let mut mapper = Mapper::new(gpu.clone(), &config).unwrap();
+    assert_eq!(sessions(&steps(&config, &mut mapper, 0..40)), [(7, 16), (15, 32), (31, 64)]);
+
+    let mut bounded = config.clone();
+    bounded.limits.max_keyframes = 10;
+    let mut mapper = Mapper::new(gpu.clone(), &bounded).unwrap();
+    assert_eq!(sessions(&steps(&bounded, &mut mapper, 0..40)), [(7, 16)]);
+
+    // A resumed mapper knows when the last session was.
+    let mut mapper = Mapper::new(gpu.clone(), &config).unwrap();
+    steps(&config, &mut mapper, 0..12);
+    let state = mapper.state(None).unwrap();
+    let mut resumed = Mapper::restore(gpu, &config, &state).unwrap();
+    (0..12).for_each(|id| resumed.insert_again(&keyframe(id, true), &state).unwrap());
+    assert_eq!(steps(&config, &mut resumed, 12..17), steps(&config, &mut mapper, 12..17));
+    assert_eq!(mapper.download().unwrap(), resumed.download().unwrap());
+}
+
+#[test]
+fn the_final_epochs_draw_each_keyframe_as_often() {
+    let Some(gpu) = adapter() else { return };
+    let mut config = MappingConfig { first_iterations: 5, iterations_per_keyframe: 5, ..Default::default() };
+    config.refine.final_epochs = 3;
+    for (least, expected) in [(0, 18), (11, 18), (25, 25)] {
+        config.refine.steps = least;
+        let mut mapper = Mapper::new(gpu.clone(), &config).unwrap();
+        for id in 0..6 {
+            mapper.insert(&keyframe(id, true), &|| false).unwrap();
+        }
+        let before = mapper.step_times().len();
+        let mut refinement = mapper.begin_refinement().unwrap();
+        while mapper.refine(&mut refinement, &|| false).unwrap().is_some() {}
+        assert_eq!(mapper.step_times().len() - before, expected, "at least {least}");
+    }
+}

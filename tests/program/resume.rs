@@ -159,6 +159,17 @@ fn what_the_tracker_was_told_and_what_memory_allows_comes_again() {
 }
 
 #[test]
+fn consolidation_ends_as_in_an_unbroken_run() {
+    if skipped_without_adapter() {
+        return;
+    }
+    let settings = ["tracking.keyframe_translation=0.005", "mapping.refine.growth=0.5", "mapping.refine.session_epochs=1"];
+    let final_epochs = ["--set", "mapping.refine.final_epochs=2", "--set", "mapping.refine.density_every=15"];
+    let more: Vec<&str> = settings.iter().flat_map(|s| ["--set", s]).chain(final_epochs).collect();
+    survives("consolidated", recording(), &more, 11);
+}
+
+#[test]
 fn a_refinement_goes_on_where_it_stood() {
     if skipped_without_adapter() {
         return;

@@ -46,6 +46,6 @@ impl Mapper {
                 lr_scale: self.config.window.final_lr_scale,
             })
             .collect();
-        Ok(self.steps(&chosen, Some(error_pixels), adam)?.len())
+        Ok(self.steps(&chosen, Some(error_pixels), self.tile_sampling(), adam)?.len())
     }
 }

@@ -1,13 +1,17 @@
-//! FinalRefinement over all keyframes, after the last one: steps at half size first, then at full size, with density control in between.
+//! Consolidation: steps over all keyframes. Each epoch draws every keyframe with an image once, in a seeded shuffle.
 //!
-//! Each epoch draws every keyframe once, in a seeded shuffle. Rates fall exponentially, as 3DGS has it for positions.
+//! Online sessions follow keyframes at constant rates. The final refinement follows the last keyframe: steps at half size first, then at full
+//! size, with density control in between; rates fall exponentially, as 3DGS has it for positions.
 
 use serde::{Deserialize, Serialize};
 
 use crate::mapping::{DensityConfig, RefineConfig};
-use crate::optimise::AdamConfig;
+use crate::optimise::{AdamConfig, StepReport};
 
 use super::{BATCH, Mapper, MappingError, Step};
+
+/// Fewer keyframes are all in the window; an online session would repeat its steps.
+const FIRST_SESSION: usize = 8;
 
 /// Where a refinement stands; begun by [`Mapper::begin_refinement`].
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -50,12 +54,50 @@ impl FinalRefinement {
 }
 
 impl Mapper {
+    /// Runs an online session if one is due, until `stop`. Returns the number of steps.
+    ///
+    /// # Errors
+    /// [`MappingError`] if a buffer does not fit or the device fails.
+    pub(super) fn consolidate(&mut self, stop: &dyn Fn() -> bool) -> Result<usize, MappingError> {
+        let config = self.config.clone();
+        let RefineConfig { growth, session_epochs, .. } = config.refine;
+        let mut views = self.views();
+        let due = ((1.0 + growth) * self.consolidated as f32).max(FIRST_SESSION as f32);
+        if growth <= 0.0 || session_epochs == 0 || self.cloud.is_empty() || (views.len() as f32) < due {
+            return Ok(0);
+        }
+        self.consolidated = views.len();
+        let mut done = 0;
+        for _ in 0..session_epochs {
+            self.rng.shuffle(&mut views);
+            for batch in views.chunks(BATCH) {
+                if stop() {
+                    return Ok(done);
+                }
+                let batch: Vec<Step> = batch.iter().map(|&keyframe| Step { keyframe, coarse: false, lr_scale: 1.0 }).collect();
+                done += self.consolidation_steps(&batch, &config.adam)?.len();
+            }
+        }
+        Ok(done)
+    }
+
+    /// Keyframes with images, ascending.
+    fn views(&self) -> Vec<usize> {
+        (0..self.keyframes.len()).filter(|&k| self.keyframes[k].has_image()).collect()
+    }
+
+    fn consolidation_steps(&mut self, batch: &[Step], adam: &AdamConfig) -> Result<Vec<StepReport>, MappingError> {
+        let sampling = if self.config.refine.all_tiles { None } else { self.tile_sampling() };
+        self.steps(batch, None, sampling, adam)
+    }
+
     /// Begins a refinement over the keyframes so far; none may come until it is done.
     ///
     /// # Errors
     /// [`MappingError`] if a buffer does not fit or the device fails.
     pub fn begin_refinement(&mut self) -> Result<FinalRefinement, MappingError> {
-        let config = self.config.refine.clone();
+        let mut config = self.config.refine.clone();
+        config.steps = config.steps.max(config.final_epochs * self.views().len());
         Ok(FinalRefinement { adam: self.config.adam.clone(), config, done: 0, epoch: Vec::new(), rounds: 0 })
     }
 
@@ -83,7 +125,7 @@ impl Mapper {
                 (refinement.done..end.min(refinement.done + BATCH)).map(|_| self.draw_from(refinement)).collect();
             let batch: Vec<Step> = keyframes.into_iter().map(|keyframe| Step { keyframe, coarse, lr_scale: 1.0 }).collect();
             adam = refinement.rates();
-            for report in self.steps(&batch, None, &adam)? {
+            for report in self.consolidation_steps(&batch, &adam)? {
                 psnr = (psnr.0 + report.loss.psnr_db(), psnr.1 + 1);
             }
             refinement.done += batch.len();
@@ -95,7 +137,7 @@ impl Mapper {
 
     fn draw_from(&mut self, refinement: &mut FinalRefinement) -> usize {
         if refinement.epoch.is_empty() {
-            refinement.epoch = (0..self.keyframes.len()).filter(|&k| self.keyframes[k].has_image()).collect();
+            refinement.epoch = self.views();
             self.rng.shuffle(&mut refinement.epoch);
         }
         refinement.epoch.pop().unwrap_or_default()
@@ -108,7 +150,7 @@ impl Mapper {
         density: &DensityConfig,
         adam: &AdamConfig,
     ) -> Result<(usize, usize), MappingError> {
-        let mut views: Vec<usize> = (0..self.keyframes.len()).filter(|&k| self.keyframes[k].has_image()).collect();
+        let mut views = self.views();
         let count = views.len();
         views.rotate_left(refinement.rounds % count);
         refinement.rounds += 1;

@@ -23,6 +23,8 @@ pub struct MapperState {
     keyframes: Vec<KeyframeState>,
     rng: u64,
     step_times: Vec<Duration>,
+    /// Keyframes with images at the last online session.
+    consolidated: usize,
     refinement: Option<FinalRefinement>,
 }
 
@@ -39,6 +41,7 @@ impl Mapper {
             keyframes: self.keyframes.iter().map(|keyframe| keyframe.state(&self.gpu)).collect::<Result<_, _>>()?,
             rng: self.rng.get_seed(),
             step_times: self.step_times.clone(),
+            consolidated: self.consolidated,
             refinement: refinement.cloned(),
         })
     }
@@ -57,6 +60,7 @@ impl Mapper {
         mapper.stats = state.stats.clone();
         mapper.rng = Rng::with_seed(state.rng);
         mapper.step_times = state.step_times.clone();
+        mapper.consolidated = state.consolidated;
         Ok(mapper)
     }
 
