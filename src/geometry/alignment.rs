@@ -85,5 +85,8 @@ mod tests {
         let apart = [Vector3::x(), Vector3::y(), Vector3::z(), Vector3::zeros()];
         assert!(align(&still, &apart, true).is_none() && align(&apart, &still, true).is_none());
         assert!(align(&apart, &apart[..3], false).is_none());
+        // Also where that place is not the origin.
+        let elsewhere = [Vector3::new(1.0, -2.0, 3.0); 4];
+        assert!(align(&elsewhere, &apart, true).is_none() && align(&apart, &elsewhere, true).is_none());
     }
 }
