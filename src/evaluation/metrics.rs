@@ -34,7 +34,7 @@ pub struct Metrics {
     /// Real-time replay: keyframes that a newer one replaced before the mapper took them.
     #[serde(default)]
     pub keyframes_deferred: u64,
-    /// Keyframes created; `None` with known poses.
+    /// Keyframes created; `None` if unknown.
     pub keyframes: Option<u64>,
     /// Absolute trajectory error, RMSE, metres.
     pub ate_rmse_m: AteFigures,

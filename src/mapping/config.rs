@@ -238,7 +238,7 @@ pub struct RefineConfig {
     pub growth_share: f32,
     /// Share of the steps, the first ones, that see the images at half size.
     pub half_size_share: f32,
-    /// Final learning rates as a share of the initial ones: positions, then all others.
+    /// Learning rate of positions at the end of the refinement, as a share of the initial one.
     pub final_lr_scale_position: f32,
     /// Factor on all other learning rates at the end of the refinement.
     pub final_lr_scale: f32,

@@ -56,7 +56,7 @@ pub struct MultiViewConfig {
     pub split_pixels: f32,
     /// At most this share of the scored Gaussians is divided at once, those with most error pixels first.
     pub max_growth: f32,
-    /// Keyframes that a Gaussian is left in peace after it came.
+    /// Least age of a Gaussian that is split or pruned, keyframes.
     pub min_age: u32,
     /// A Gaussian that never adds more than this to a pixel is removed.
     pub min_weight: f32,
