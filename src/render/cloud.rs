@@ -36,7 +36,7 @@ pub struct GpuCloud {
 }
 
 /// A map with its moments and averages, read back.
-#[derive(Clone, Debug, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct CloudState {
     capacity: usize,
     limit: Option<usize>,

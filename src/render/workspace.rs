@@ -44,7 +44,7 @@ pub(crate) struct Workspace {
 }
 
 /// Capacities of the scratch buffers.
-#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
 pub struct Capacities {
     gaussians: usize,
     intersections: usize,

@@ -64,7 +64,7 @@ pub enum CheckpointError {
 }
 
 /// Properties that a resumed run must share with its checkpoint.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Identity {
     /// The whole configuration, TOML.
     config: String,
@@ -89,7 +89,7 @@ pub(crate) struct RunState {
 }
 
 /// Wall-clock time and interruptions of a run, up to a checkpoint.
-#[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Elapsed {
     /// Wall-clock time of all processes, seconds.
     pub wall_s: f64,

@@ -1,7 +1,7 @@
 //! Writes checkpoints during a run, and holds the state from which a resumed run continues.
 
 use std::path::{Path, PathBuf};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use super::checkpoint::{Checkpoint, CheckpointError, Elapsed, Identity, RunState};
 use super::history::KeyframeRecord;
@@ -37,7 +37,7 @@ impl Checkpointer {
     pub fn begin(path: &Path, recording: &Recording, gpu: &Gpu) -> Result<Self, WriteError> {
         let identity = Identity::of(recording, gpu);
         Checkpoint::write(path, &identity, None)?;
-        Ok(Self::new(path, identity, recording, None))
+        Ok(Self::new(path, identity, interval(recording), None))
     }
 
     /// Continues the run of a checkpoint.
@@ -47,16 +47,16 @@ impl Checkpointer {
     pub fn resume(checkpoint: Checkpoint, recording: &Recording, gpu: &Gpu) -> Result<Self, CheckpointError> {
         let identity = Identity::of(recording, gpu);
         checkpoint.identity.check(&checkpoint.path, &identity)?;
-        let mut resumed = Self::new(&checkpoint.path, identity, recording, checkpoint.state);
+        let mut resumed = Self::new(&checkpoint.path, identity, interval(recording), checkpoint.state);
         resumed.earlier.resumed += 1;
         Ok(resumed)
     }
 
-    fn new(path: &Path, identity: Identity, recording: &Recording, resume_from: Option<RunState>) -> Self {
+    fn new(path: &Path, identity: Identity, every: usize, resume_from: Option<RunState>) -> Self {
         Self {
             path: path.into(),
             identity,
-            every: recording.config().checkpoint_every.unwrap_or(usize::MAX),
+            every,
             since: 0,
             digest: MessageDigest::default(),
             feedback: Vec::new(),
@@ -111,14 +111,66 @@ impl Checkpointer {
         refinement: Option<&FinalRefinement>,
         records: &[KeyframeRecord],
     ) -> Result<Option<usize>, CheckpointError> {
-        self.since += 1;
-        if self.since < self.every {
+        if !self.is_due() {
             return Ok(None);
         }
-        self.since = 0;
-        let wall_s = self.earlier.wall_s + self.started.elapsed().as_secs_f64();
-        let elapsed = Elapsed { wall_s, ..self.earlier };
+        let elapsed = self.elapsed(self.started.elapsed());
         let state = RunState::new(self.digest, mapper.state(refinement)?, records, &self.feedback, elapsed);
         Ok(Some(Checkpoint::write(&self.path, &self.identity, Some(&state))?))
+    }
+
+    /// Counts a finished keyframe or round; whether a checkpoint is due.
+    fn is_due(&mut self) -> bool {
+        self.since += 1;
+        let due = self.since >= self.every;
+        if due {
+            self.since = 0;
+        }
+        due
+    }
+
+    /// Time of all processes, this one included.
+    fn elapsed(&self, here: Duration) -> Elapsed {
+        Elapsed { wall_s: self.earlier.wall_s + here.as_secs_f64(), ..self.earlier }
+    }
+}
+
+/// Keyframes or rounds between two checkpoints.
+fn interval(recording: &Recording) -> usize {
+    recording.config().checkpoint_every.unwrap_or(usize::MAX)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::mapping::MapperState;
+
+    fn checkpointer(every: usize, resume_from: Option<RunState>) -> Checkpointer {
+        Checkpointer::new(Path::new("out/checkpoint.bin"), Identity::default(), every, resume_from)
+    }
+
+    #[test]
+    fn a_checkpoint_is_due_after_each_interval() {
+        let due = |every| {
+            let mut checkpointer = checkpointer(every, None);
+            (1..=7).filter(|_| checkpointer.is_due()).count()
+        };
+        assert_eq!([1, 2, 3, 7, 8, usize::MAX].map(due), [7, 3, 2, 1, 0, 0]);
+        let mut third = checkpointer(3, None);
+        assert_eq!([(); 6].map(|()| third.is_due()), [false, false, true, false, false, true]);
+    }
+
+    #[test]
+    fn a_resumed_run_continues_from_its_state_once_and_adds_its_time() {
+        let earlier = Elapsed { wall_s: 40.0, resumed: 2 };
+        let state = RunState::new(MessageDigest::default(), MapperState::default(), &[], &[], earlier);
+        let mut resumed = checkpointer(3, Some(state));
+        assert!(resumed.is_behind());
+        assert_eq!(resumed.take_state().unwrap().elapsed, earlier);
+        assert!(!resumed.is_behind() && resumed.take_state().is_none());
+        assert_eq!(resumed.earlier(), earlier);
+        assert_eq!(resumed.elapsed(Duration::from_millis(1500)), Elapsed { wall_s: 41.5, resumed: 2 });
+        assert_eq!(checkpointer(3, None).elapsed(Duration::from_millis(1500)), Elapsed { wall_s: 1.5, resumed: 0 });
+        assert!(!checkpointer(3, None).is_behind());
     }
 }

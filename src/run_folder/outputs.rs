@@ -229,8 +229,7 @@ pub fn evaluate(
     let (sequence, config) = (recording.sequence(), recording.config());
     remove_pictures(out)?;
     let truth = sequence.groundtruth.as_ref();
-    // One camera alone cannot know the scale.
-    let alignment = if sequence.sensor.kind() == SensorKind::Mono { Alignment::Similarity } else { Alignment::Rigid };
+    let alignment = alignment(sequence.sensor.kind());
     let errors = |estimate: &Trajectory| truth.and_then(|truth| evaluate_trajectory(truth, estimate, alignment).ok());
     let (all, keyframes) = (errors(input.trajectory), errors(&input.keyframes));
     remove_file(&out.join(DRAWING))?;
@@ -241,13 +240,9 @@ pub fn evaluate(
     let mut comparison = Comparison::of(input.trajectory, truth.zip(all.as_ref()));
     let is_held_out = |index: usize| config.replay.is_held_out(index);
     let held_out = input.poses.iter().filter(|(index, _)| is_held_out(*index)).count();
-    let mut seen = 0;
-    let mut picture_error = None;
+    let mut pictures = Pictures::new(out, held_out);
     let mut on_held_out = |view: ComparedView| {
-        if keeps_picture(seen, held_out) && picture_error.is_none() {
-            picture_error = write_picture(out, &view).err();
-        }
-        seen += 1;
+        pictures.add(&view);
         comparison.views.push(view.figures);
     };
     let selection = ViewSelection {
@@ -258,9 +253,7 @@ pub fn evaluate(
     };
     let source = ViewSource { sequence, map_scale: config.map_scale, gpu, cloud: input.cloud };
     let images = evaluate_views(source, &selection, &mut on_held_out, on_view)?;
-    if let Some(error) = picture_error {
-        return Err(error);
-    }
+    pictures.finish()?;
     write_records(&out.join(COMPARISON), &comparison)?;
     Ok(Evaluation {
         ate_rmse_m: AteFigures {
@@ -275,9 +268,37 @@ pub fn evaluate(
     })
 }
 
-/// Whether the `nth` of all held-out views is kept as a picture.
-fn keeps_picture(nth: usize, held_out: usize) -> bool {
-    nth.is_multiple_of(held_out.div_ceil(MAX_PICTURES).max(1))
+/// Mono has no metric scale.
+fn alignment(sensor: SensorKind) -> Alignment {
+    match sensor {
+        SensorKind::Mono => Alignment::Similarity,
+        SensorKind::Stereo | SensorKind::Rgbd => Alignment::Rigid,
+    }
+}
+
+/// Pictures of at most [`MAX_PICTURES`] held-out views, spread evenly. None is written after the first that fails.
+struct Pictures<'a> {
+    out: &'a Path,
+    every: usize,
+    seen: usize,
+    error: Option<OutputError>,
+}
+
+impl<'a> Pictures<'a> {
+    fn new(out: &'a Path, held_out: usize) -> Self {
+        Self { out, every: held_out.div_ceil(MAX_PICTURES).max(1), seen: 0, error: None }
+    }
+
+    fn add(&mut self, view: &ComparedView) {
+        if self.error.is_none() && self.seen.is_multiple_of(self.every) {
+            self.error = write_picture(self.out, view).err();
+        }
+        self.seen += 1;
+    }
+
+    fn finish(self) -> Result<(), OutputError> {
+        self.error.map_or(Ok(()), Err)
+    }
 }
 
 /// File name of a held-out view in [`VIEWS`].

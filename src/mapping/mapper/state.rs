@@ -15,7 +15,7 @@ use crate::optimise::TrainerState;
 use crate::render::{CloudState, GpuCloud};
 
 /// Between two keyframes, or between two rounds of a refinement.
-#[derive(Debug, Serialize, Deserialize)]
+#[derive(Debug, Default, Serialize, Deserialize)]
 pub struct MapperState {
     cloud: CloudState,
     trainer: TrainerState,

@@ -9,7 +9,7 @@ use crate::optimise::image_buffers;
 use crate::render::Capacities;
 
 /// Number of steps and buffer capacities of a [`Trainer`].
-#[derive(Clone, Debug, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct TrainerState {
     /// Steps submitted so far: seeds the draws of tiles, and says when harmonics move.
     steps: usize,

@@ -65,14 +65,42 @@ fn only_files_of_an_earlier_run_are_removed() {
     assert!(matches!(remove_checkpoint(folder.path()), Err(OutputError::Remove { .. })));
 }
 
+fn view(frame: usize) -> ComparedView {
+    let figures = ViewRecord { frame, psnr_db: None, ssim: 1.0, depth_l1_m: None };
+    ComparedView { figures, recorded: RgbImage::new(1, 1), rendered: RgbImage::new(1, 1) }
+}
+
 #[test]
 fn at_most_a_hundred_pictures_are_kept_spread_evenly() {
-    for held_out in [1, 5, 100, 101, 250, 1000] {
-        let kept: Vec<usize> = (0..held_out).filter(|nth| keeps_picture(*nth, held_out)).collect();
-        let gap = held_out.div_ceil(100);
-        assert!(kept.len() <= 100 && kept.len() == held_out.div_ceil(gap), "{held_out}: {}", kept.len());
-        assert!(kept[0] == 0 && kept.windows(2).all(|pair| pair[1] - pair[0] == gap), "{held_out}: {kept:?}");
+    for held_out in [0, 1, 5, 100, 101, 250, 1000] {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::create_dir(folder.path().join(VIEWS)).unwrap();
+        let mut pictures = Pictures::new(folder.path(), held_out);
+        (0..held_out).for_each(|frame| pictures.add(&view(frame)));
+        pictures.finish().unwrap();
+        let gap = held_out.div_ceil(100).max(1);
+        let kept: Vec<String> = (0..held_out).step_by(gap).map(picture_name).collect();
+        assert!(kept.len() <= 100);
+        assert_eq!(names(&folder.path().join(VIEWS)), kept, "of {held_out}");
     }
+}
+
+#[test]
+fn no_picture_is_written_after_one_that_failed() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut pictures = Pictures::new(folder.path(), 3);
+    pictures.add(&view(0));
+    std::fs::create_dir(folder.path().join(VIEWS)).unwrap();
+    pictures.add(&view(1));
+    let error = pictures.finish().unwrap_err().to_string();
+    assert!(error.contains("000000.png"), "{error}");
+    assert!(names(&folder.path().join(VIEWS)).is_empty());
+}
+
+#[test]
+fn only_mono_is_aligned_by_a_similarity() {
+    let sensors = [SensorKind::Mono, SensorKind::Stereo, SensorKind::Rgbd];
+    assert_eq!(sensors.map(alignment), [Alignment::Similarity, Alignment::Rigid, Alignment::Rigid]);
 }
 
 #[test]
