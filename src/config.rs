@@ -295,10 +295,10 @@ impl Config {
         if self.checkpoint_every == Some(0) {
             return value("checkpoint_every must be at least 1".into());
         }
-        if self.checkpoint_every.is_some() && (self.replay.real_time || self.mapping.yields_to_keyframes) {
+        if self.checkpoint_every.is_some() && (self.replay.real_time || self.mapping.depends_on_time()) {
             return value(
-                "a run against the clock does not repeat and cannot be resumed: leave --checkpoint-every out, or --real-time and \
-                 --preset realtime (replay.real_time, mapping.yields_to_keyframes)"
+                "a run against the clock does not repeat and cannot be resumed: leave --checkpoint-every out, or --real-time, --time and \
+                 --preset realtime (replay.real_time, mapping.yields_to_keyframes, mapping.refine.seconds)"
                     .into(),
             );
         }

@@ -59,6 +59,9 @@ pub struct RunArgs {
     /// Named settings; override the configuration file, and the other options override them.
     #[arg(long, alias = "budget", value_enum)]
     preset: Option<Preset>,
+    /// Consolidate the map for so many seconds after the last keyframe, whatever the preset's number of epochs. Such a run does not repeat.
+    #[arg(long, value_name = "SECONDS")]
+    time: Option<f64>,
     /// Most Gaussians that the map may have at any time; the least useful go first.
     #[arg(long)]
     max_gaussians: Option<usize>,
@@ -133,6 +136,7 @@ impl RunArgs {
         config.replay.real_time |= self.real_time;
         config.adapter = self.adapter.clone().or(config.adapter);
         config.checkpoint_every = self.checkpoint_every.or(config.checkpoint_every);
+        config.mapping.refine.seconds = self.time.or(config.mapping.refine.seconds);
         config.mapping.limits.max_gaussians = self.max_gaussians.or(config.mapping.limits.max_gaussians);
         config.mapping.limits.max_gpu_bytes = self.max_gpu_memory.or(config.mapping.limits.max_gpu_bytes);
         config.with_settings(&self.set).into_diagnostic()

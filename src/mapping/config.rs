@@ -228,6 +228,9 @@ pub struct RefineConfig {
     pub final_epochs: usize,
     /// Least steps after the last keyframe, one view each, whatever the number of keyframes. Without steps and epochs the map stays as it is.
     pub steps: usize,
+    /// Wall-clock time after the last keyframe, seconds: replaces the number of steps. Such a run does not repeat.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub seconds: Option<f64>,
     /// Whether steps of consolidation use all tiles instead of sampling them.
     pub all_tiles: bool,
     /// Density is controlled each time after so many steps,
@@ -244,6 +247,22 @@ pub struct RefineConfig {
     pub final_lr_scale: f32,
 }
 
+impl RefineConfig {
+    /// Checks every value but the shares and rates.
+    fn validate(&self) -> Result<(), String> {
+        if !(self.growth.is_finite() && self.growth >= 0.0) {
+            return Err(format!("growth must be zero or more, not {}", self.growth));
+        }
+        if self.seconds.is_some_and(|seconds| !(seconds.is_finite() && seconds >= 0.0)) {
+            return Err("seconds must be zero or more".into());
+        }
+        if self.density_every == 0 || self.density_views == 0 {
+            return Err("density_every and density_views must be at least 1".into());
+        }
+        Ok(())
+    }
+}
+
 impl Default for RefineConfig {
     fn default() -> Self {
         Self {
@@ -251,6 +270,7 @@ impl Default for RefineConfig {
             session_epochs: 0,
             final_epochs: 0,
             steps: 0,
+            seconds: None,
             all_tiles: false,
             density_every: 200,
             density_views: 10,
@@ -291,8 +311,13 @@ impl MappingConfig {
 
     /// Whether any step may be taken at half the size.
     pub fn learns_at_half_size(&self) -> bool {
-        self.schedule.coarse_share > 0.0
-            || (self.refine.steps.max(self.refine.final_epochs) > 0 && self.refine.half_size_share > 0.0)
+        let RefineConfig { steps, final_epochs, seconds, half_size_share, .. } = self.refine;
+        self.schedule.coarse_share > 0.0 || ((steps.max(final_epochs) > 0 || seconds.is_some()) && half_size_share > 0.0)
+    }
+
+    /// Whether the clock decides on the number of steps. Such a run neither repeats nor resumes.
+    pub fn depends_on_time(&self) -> bool {
+        self.yields_to_keyframes || self.refine.seconds.is_some()
     }
 
     /// Checks every value.
@@ -339,12 +364,6 @@ impl MappingConfig {
             return Err("mapping.window.recent and mapping.points.size_range must be at least 1".into());
         }
         self.limits.validate().map_err(|e| format!("mapping.limits: {e}"))?;
-        if !(self.refine.growth.is_finite() && self.refine.growth >= 0.0) {
-            return Err(format!("mapping.refine.growth must be zero or more, not {}", self.refine.growth));
-        }
-        if self.refine.density_every == 0 || self.refine.density_views == 0 {
-            return Err("mapping.refine.density_every and mapping.refine.density_views must be at least 1".into());
-        }
         let closed_shares = [
             ("refine.growth_share", self.refine.growth_share),
             ("refine.half_size_share", self.refine.half_size_share),
@@ -353,6 +372,7 @@ impl MappingConfig {
         if let Some((name, value)) = closed_shares.iter().find(|(_, value)| !(0.0..=1.0).contains(value)) {
             return Err(format!("mapping.{name} must lie between 0 and 1, not {value}"));
         }
+        self.refine.validate().map_err(|e| format!("mapping.refine: {e}"))?;
         self.tile_sampling.validate().map_err(|e| format!("mapping.tile_sampling: {e}"))?;
         self.exposure.validate().map_err(|e| format!("mapping.exposure: {e}"))?;
         self.plane_sweep.validate().map_err(|e| format!("mapping.plane_sweep: {e}"))?;

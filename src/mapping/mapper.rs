@@ -336,9 +336,8 @@ impl Mapper {
     /// Takes a session's steps until `end` are taken or nothing more is gained; returns their number and the sum of the PSNR before each.
     fn steps_of(&mut self, session: &mut Session, end: usize, stop: &dyn Fn() -> bool) -> Result<(usize, f32), MappingError> {
         let (mut psnr_sum, mut done) = (0.0, 0);
-        let most = if self.config.yields_to_keyframes { YIELDING_BATCH } else { BATCH };
         while !session.is_over(end) && !stop() {
-            let count = most.min(end - session.taken());
+            let count = self.batch().min(end - session.taken());
             let batch = session.next(count, &self.keyframes, &mut self.rng, &self.config.window, &self.config.schedule);
             let adam = &self.config.clone().adam;
             let reports = self.steps(&batch, None, self.tile_sampling(), adam)?;
@@ -349,6 +348,11 @@ impl Mapper {
             session.take_note(&batch, &losses, self.config.schedule.min_gain);
         }
         Ok((done, psnr_sum))
+    }
+
+    /// Steps submitted at once.
+    fn batch(&self) -> usize {
+        if self.config.yields_to_keyframes { YIELDING_BATCH } else { BATCH }
     }
 
     /// Moves the window's keyframes down the gradients of the steps; the first keyframe is the world and stays.

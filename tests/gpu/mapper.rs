@@ -117,6 +117,36 @@ fn online_sessions_follow_the_growth_of_the_keyframes() {
     assert_eq!(mapper.download().unwrap(), resumed.download().unwrap());
 }
 
+/// Steps that yield to keyframes go on over all keyframes until the next one waits.
+#[test]
+fn time_between_keyframes_goes_to_consolidation() {
+    let Some(gpu) = adapter() else { return };
+    let config =
+        MappingConfig { first_iterations: 5, iterations_per_keyframe: 5, yields_to_keyframes: true, ..Default::default() };
+    let mut mapper = Mapper::new(gpu, &config).unwrap();
+    for id in 0..4 {
+        let polls = std::cell::Cell::new(0);
+        let stop = || polls.replace(polls.get() + 1) >= 30;
+        let report = mapper.insert(&keyframe(id, true), &stop).unwrap();
+        assert!(report.iterations > 20 && report.iterations < 100, "{report:?}");
+    }
+}
+
+#[test]
+fn a_refinement_of_so_many_seconds_ends_by_the_clock() {
+    let Some(gpu) = adapter() else { return };
+    let mut config = MappingConfig { first_iterations: 5, iterations_per_keyframe: 5, ..Default::default() };
+    for (seconds, takes_steps) in [(0.0, false), (0.4, true)] {
+        config.refine.seconds = Some(seconds);
+        let mut mapper = Mapper::new(gpu.clone(), &config).unwrap();
+        mapper.insert(&keyframe(0, true), &|| false).unwrap();
+        let before = mapper.step_times().len();
+        let mut refinement = mapper.begin_refinement().unwrap();
+        while mapper.refine(&mut refinement, &|| false).unwrap().is_some() {}
+        assert_eq!(mapper.step_times().len() > before, takes_steps, "{seconds} s");
+    }
+}
+
 #[test]
 fn the_final_epochs_draw_each_keyframe_as_often() {
     let Some(gpu) = adapter() else { return };

@@ -327,7 +327,9 @@ fn what_is_finished_or_was_never_begun_says_so() {
 #[test]
 fn runs_that_do_not_repeat_keep_no_checkpoints() {
     let out = scratch().join("never");
-    for more in [&["--real-time"][..], &["--preset", "realtime"], &["--set", "mapping.yields_to_keyframes=true"]] {
+    for more in
+        [&["--real-time"][..], &["--preset", "realtime"], &["--set", "mapping.yields_to_keyframes=true"], &["--time", "5"]]
+    {
         finish(keeping(recording(), &out, more)).refused(&["cannot be resumed", "--checkpoint-every", "--real-time"]);
     }
     finish(run_command(recording(), &out, &["--checkpoint-every", "0"])).refused(&["checkpoint_every must be at least 1"]);

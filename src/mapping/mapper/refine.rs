@@ -3,6 +3,8 @@
 //! Online sessions follow keyframes at constant rates. The final refinement follows the last keyframe: steps at half size first, then at full
 //! size, with density control in between; rates fall exponentially, as 3DGS has it for positions.
 
+use std::time::Instant;
+
 use serde::{Deserialize, Serialize};
 
 use crate::mapping::{DensityConfig, RefineConfig};
@@ -23,6 +25,9 @@ pub struct FinalRefinement {
     /// Keyframes left of this epoch.
     epoch: Vec<usize>,
     rounds: usize,
+    /// A refinement of so many seconds has no checkpoint.
+    #[serde(skip)]
+    started: Option<Instant>,
 }
 
 /// Result of a refinement round.
@@ -41,9 +46,17 @@ pub struct RefineReport {
 }
 
 impl FinalRefinement {
-    /// Share of the steps that are done, 0 to 1.
+    /// Share of the steps, or of the time, that is spent; 1 at the end.
     fn progress(&self) -> f32 {
-        self.done as f32 / self.config.steps.max(1) as f32
+        match (self.config.seconds, self.started) {
+            (Some(seconds), Some(started)) => (started.elapsed().as_secs_f64() / seconds.max(f64::MIN_POSITIVE)).min(1.0) as f32,
+            _ if self.config.steps == 0 => 1.0,
+            _ => self.done as f32 / self.config.steps as f32,
+        }
+    }
+
+    fn is_done(&self) -> bool {
+        self.progress() >= 1.0
     }
 
     /// The rates for the next step.
@@ -54,23 +67,18 @@ impl FinalRefinement {
 }
 
 impl Mapper {
-    /// Runs an online session if one is due, until `stop`. Returns the number of steps.
+    /// Runs an online session if one is due, until `stop`; where steps yield to keyframes, without end. Returns the number of steps.
     ///
     /// # Errors
     /// [`MappingError`] if a buffer does not fit or the device fails.
     pub(super) fn consolidate(&mut self, stop: &dyn Fn() -> bool) -> Result<usize, MappingError> {
         let config = self.config.clone();
-        let RefineConfig { growth, session_epochs, .. } = config.refine;
         let mut views = self.views();
-        let due = ((1.0 + growth) * self.consolidated as f32).max(FIRST_SESSION as f32);
-        if growth <= 0.0 || session_epochs == 0 || self.cloud.is_empty() || (views.len() as f32) < due {
-            return Ok(0);
-        }
-        self.consolidated = views.len();
+        let epochs = self.epochs_due(views.len());
         let mut done = 0;
-        for _ in 0..session_epochs {
+        for _ in 0..epochs {
             self.rng.shuffle(&mut views);
-            for batch in views.chunks(BATCH) {
+            for batch in views.chunks(self.batch()) {
                 if stop() {
                     return Ok(done);
                 }
@@ -79,6 +87,22 @@ impl Mapper {
             }
         }
         Ok(done)
+    }
+
+    /// Epochs of the online session that is due with so many `views`.
+    fn epochs_due(&mut self, views: usize) -> usize {
+        let RefineConfig { growth, session_epochs, .. } = self.config.refine;
+        let due = ((1.0 + growth) * self.consolidated as f32).max(FIRST_SESSION as f32);
+        if self.cloud.is_empty() || views == 0 {
+            0
+        } else if self.config.yields_to_keyframes {
+            usize::MAX
+        } else if growth > 0.0 && views as f32 >= due {
+            self.consolidated = views;
+            session_epochs
+        } else {
+            0
+        }
     }
 
     /// Keyframes with images, ascending.
@@ -97,8 +121,12 @@ impl Mapper {
     /// [`MappingError`] if a buffer does not fit or the device fails.
     pub fn begin_refinement(&mut self) -> Result<FinalRefinement, MappingError> {
         let mut config = self.config.refine.clone();
-        config.steps = config.steps.max(config.final_epochs * self.views().len());
-        Ok(FinalRefinement { adam: self.config.adam.clone(), config, done: 0, epoch: Vec::new(), rounds: 0 })
+        config.steps = match config.seconds {
+            Some(_) => usize::MAX,
+            None => config.steps.max(config.final_epochs * self.views().len()),
+        };
+        let started = config.seconds.map(|_| Instant::now());
+        Ok(FinalRefinement { adam: self.config.adam.clone(), config, done: 0, epoch: Vec::new(), rounds: 0, started })
     }
 
     /// The steps up to the next density control, and that; `None` when all are done, or `stop` says so.
@@ -111,7 +139,7 @@ impl Mapper {
         stop: &dyn Fn() -> bool,
     ) -> Result<Option<RefineReport>, MappingError> {
         let RefineConfig { steps, density_every, growth_share, half_size_share, .. } = refinement.config;
-        if refinement.done >= steps || self.cloud.is_empty() || self.keyframes.is_empty() || stop() {
+        if refinement.is_done() || self.cloud.is_empty() || self.keyframes.is_empty() || stop() {
             return Ok(None);
         }
         let density = DensityConfig { views: refinement.config.density_views, ..self.config.density.clone() };
@@ -119,7 +147,7 @@ impl Mapper {
         let mut adam = refinement.rates();
         let mut psnr = (0.0, 0);
         let end = steps.min(refinement.done + density_every);
-        while refinement.done < end && !stop() {
+        while refinement.done < end && !refinement.is_done() && !stop() {
             let coarse = refinement.progress() < half_size_share;
             let keyframes: Vec<usize> =
                 (refinement.done..end.min(refinement.done + BATCH)).map(|_| self.draw_from(refinement)).collect();
@@ -130,7 +158,7 @@ impl Mapper {
             }
             refinement.done += batch.len();
         }
-        let (pruned, grown) = if refinement.done < steps { self.score_and_control(refinement, &density, &adam)? } else { (0, 0) };
+        let (pruned, grown) = if !refinement.is_done() { self.score_and_control(refinement, &density, &adam)? } else { (0, 0) };
         let psnr_db = psnr.0 / psnr.1.max(1) as f32;
         Ok(Some(RefineReport { steps_done: refinement.done, pruned, grown, gaussians: self.cloud.len(), psnr_db }))
     }
