@@ -229,7 +229,7 @@ pub struct RefineConfig {
     /// Least steps after the last keyframe, one view each, whatever the number of keyframes. Without steps and epochs the map stays as it is.
     pub steps: usize,
     /// Wall-clock time after the last keyframe, seconds: replaces the number of steps. Such a run does not repeat.
-    #[serde(skip_serializing_if = "Option::is_none")]
+    // Checkpoints hold this struct in postcard, where no field may be left out.
     pub seconds: Option<f64>,
     /// Whether steps of consolidation use all tiles instead of sampling them.
     pub all_tiles: bool,
