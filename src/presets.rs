@@ -36,11 +36,11 @@ impl Preset {
             Self::Realtime => {
                 config.replay.real_time = true;
                 mapping.yields_to_keyframes = true;
+                // The time left after these steps goes to consolidation, which gains more a step.
                 mapping.first_iterations = 10;
                 mapping.iterations_per_keyframe = 10;
                 mapping.window.recent = 4;
                 mapping.window.covisible = 2;
-                // The time left after these steps goes to consolidation, which yields more a step.
                 // Few steps fit between two keyframes, and density control costs about six of them: it runs after every fifth keyframe, and
                 // before the steps, so that no keyframe waits for it.
                 mapping.density.every = 5;
