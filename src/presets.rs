@@ -7,7 +7,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::calibration::{BenchScene, StepRunner};
 use crate::config::Config;
-use crate::gpu::{Gpu, GpuError};
+use crate::geometry::Pinhole;
+use crate::gpu::{AdapterSummary, Gpu, GpuError};
 use crate::recording::Recording;
 use crate::render::BlendForm;
 
@@ -28,6 +29,15 @@ pub enum Preset {
 impl Preset {
     /// All presets, the fastest one first.
     pub const ALL: [Self; 4] = [Self::Realtime, Self::Balanced, Self::Quality, Self::Best];
+
+    /// What a run uses that chooses none: as many steps as an adapter of this kind takes in about the recording's duration.
+    pub fn for_adapter(adapter: &AdapterSummary) -> Self {
+        match adapter.kind.as_str() {
+            "discrete" => Self::Best,
+            "integrated" | "virtual" => Self::Quality,
+            _ => Self::Balanced,
+        }
+    }
 
     /// Sets the values in which the preset differs from the defaults.
     pub fn apply(self, config: &mut Config) {
@@ -79,6 +89,40 @@ const PIXELS_PER_GAUSSIAN: u32 = 8;
 /// Least side of the mapped image, pixels.
 const LEAST_PIXELS: u32 = 96;
 
+/// Most pixels of the mapped image on an adapter of each kind: about 0.1 s a step or less.
+const PIXELS_ON_CPU: u32 = 150_000;
+const PIXELS_ON_INTEGRATED: u32 = 600_000;
+
+/// Share of the recorded resolution that is mapped where nothing chooses one: the largest at which an adapter of this kind takes about 0.1 s a
+/// step or less. A discrete GPU maps at the recorded resolution.
+pub fn default_scale(adapter: &AdapterSummary, recording: &Recording) -> f64 {
+    scale_within(most_pixels(&adapter.kind), &recording.sequence().camera.pinhole)
+}
+
+fn most_pixels(adapter_kind: &str) -> u32 {
+    match adapter_kind {
+        "discrete" => u32::MAX,
+        "integrated" | "virtual" => PIXELS_ON_INTEGRATED,
+        _ => PIXELS_ON_CPU,
+    }
+}
+
+/// The largest scale with at most so many pixels, or the smallest that leaves [`LEAST_PIXELS`] on a side.
+fn scale_within(most_pixels: u32, recorded: &Pinhole) -> f64 {
+    let mut chosen = 1.0;
+    for scale in SCALES {
+        let pinhole = recorded.scaled(scale);
+        if scale < 1.0 && pinhole.width.min(pinhole.height) < LEAST_PIXELS {
+            break;
+        }
+        chosen = scale;
+        if u64::from(pinhole.width) * u64::from(pinhole.height) <= u64::from(most_pixels) {
+            break;
+        }
+    }
+    chosen
+}
+
 /// Measures the largest share of the recorded resolution at which a training step is fast enough for real time.
 ///
 /// # Errors
@@ -106,6 +150,21 @@ pub fn realtime_scale(gpu: &Arc<Gpu>, recording: &Recording) -> Result<f64, GpuE
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn resolution_and_preset_follow_from_the_kind_of_adapter() {
+        let of = |width: u32, height: u32| Pinhole { fx: 500.0, fy: 500.0, cx: 0.0, cy: 0.0, width, height };
+        let on = |kind: &str, recorded: Pinhole| scale_within(most_pixels(kind), &recorded);
+        assert_eq!([of(160, 120), of(640, 480), of(1920, 1080)].map(|p| on("cpu", p)), [1.0, 0.5, 0.25]);
+        assert_eq!(on("cpu", of(4000, 150)), 0.75, "half the size would have too few rows");
+        assert_eq!((on("integrated", of(640, 480)), on("integrated", of(1920, 1080))), (1.0, 0.5));
+        assert_eq!(on("discrete", of(3840, 2160)), 1.0);
+        let preset = |kind: &str| {
+            let text = String::new;
+            Preset::for_adapter(&AdapterSummary { name: text(), backend: text(), kind: kind.into(), driver: text() })
+        };
+        assert_eq!(["discrete", "integrated", "cpu"].map(preset), [Preset::Best, Preset::Quality, Preset::Balanced]);
+    }
 
     #[test]
     fn presets_are_valid_and_differ() {

@@ -6,6 +6,7 @@ use crate::config::{Config, ConfigError};
 use crate::evaluation::image::WINDOW as SSIM_WINDOW;
 use crate::evaluation::trajectory::MAX_TIME_DIFFERENCE_S;
 use crate::geometry::{Pinhole, Se3};
+use crate::mapping::MappingConfig;
 use crate::sequence::{Sensor, Sequence, SequenceError};
 
 /// A selection of a sequence's frames and the configuration that maps them. Immutable: a change makes a new value.
@@ -104,6 +105,16 @@ impl Recording {
         self.config.map_scale = map_scale;
         self.config.validate()?;
         self.check_size()?;
+        Ok(self)
+    }
+
+    /// The recording mapped with other settings of the mapper.
+    ///
+    /// # Errors
+    /// If a value is out of its range.
+    pub fn with_mapping(mut self, mapping: MappingConfig) -> Result<Self, RecordingError> {
+        self.config.mapping = mapping;
+        self.config.validate()?;
         Ok(self)
     }
 

@@ -1,6 +1,7 @@
 //! `keysplat run`
 
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
@@ -34,7 +35,7 @@ pub struct RunArgs {
     /// Camera preset to use instead of the recording's own calibration; for a video, or the path of a camera.toml.
     #[arg(long)]
     camera: Option<String>,
-    /// Mapping resolution as a share of the recorded one, e.g. 0.5.
+    /// Mapping resolution as a share of the recorded one, e.g. 0.5. Without it and without --config it follows from the kind of adapter.
     #[arg(long)]
     map_scale: Option<f64>,
     /// File format of the map, `map.<extension>` in the folder of the results.
@@ -56,7 +57,8 @@ pub struct RunArgs {
     /// Part of the name of the adapter to use (see `keysplat adapters`).
     #[arg(long)]
     adapter: Option<String>,
-    /// Named settings; override the configuration file, and the other options override them.
+    /// Named settings; override the configuration file, and the other options override them. Without it and without --config it follows from
+    /// the kind of adapter.
     #[arg(long, alias = "budget", value_enum)]
     preset: Option<Preset>,
     /// Consolidate the map for so many seconds after the last keyframe, whatever the preset's number of epochs. Such a run does not repeat.
@@ -106,13 +108,33 @@ fn parse_range(text: &str) -> Result<(usize, usize), String> {
 }
 
 impl RunArgs {
-    pub fn resolve(&self) -> miette::Result<Config> {
+    /// Opens the recording and the adapter. Without options and file, preset and mapping resolution follow from the kind of adapter.
+    pub fn open(&self) -> miette::Result<(Recording, Arc<Gpu>)> {
+        let mut recording = Recording::open(self.resolve(self.preset)?).into_diagnostic()?;
+        let gpu = Gpu::open(recording.config().adapter.as_deref()).into_diagnostic()?;
+        if self.config.is_none() && self.preset.is_none() && !self.known_poses {
+            let config = self.resolve(Some(Preset::for_adapter(&gpu.adapter)))?;
+            recording = recording.with_mapping(config.mapping).into_diagnostic()?;
+        }
+        let scale = match self.preset {
+            _ if self.map_scale.is_some() => None,
+            Some(Preset::Realtime) => Some(presets::realtime_scale(&gpu, &recording).into_diagnostic()?),
+            _ if self.config.is_some() => None,
+            _ => Some(presets::default_scale(&gpu.adapter, &recording)),
+        };
+        if let Some(scale) = scale {
+            recording = recording.at_scale(scale).into_diagnostic()?;
+        }
+        Ok((recording, gpu))
+    }
+
+    fn resolve(&self, preset: Option<Preset>) -> miette::Result<Config> {
         let mut config = match &self.config {
             Some(path) => Config::read_with(path, self.known_poses).into_diagnostic()?,
             None if self.known_poses => Config::offline(),
             None => Config::default(),
         };
-        if let Some(preset) = self.preset {
+        if let Some(preset) = preset {
             preset.apply(&mut config);
         }
         if let Some(path) = &self.sequence {
@@ -144,12 +166,7 @@ impl RunArgs {
 }
 
 pub fn run(args: &RunArgs, verbosity: Verbosity) -> miette::Result<()> {
-    let mut recording = Recording::open(args.resolve()?).into_diagnostic()?;
-    let gpu = Gpu::open(recording.config().adapter.as_deref()).into_diagnostic()?;
-    if args.preset == Some(Preset::Realtime) && args.map_scale.is_none() {
-        let scale = presets::realtime_scale(&gpu, &recording).into_diagnostic()?;
-        recording = recording.at_scale(scale).into_diagnostic()?;
-    }
+    let (recording, gpu) = args.open()?;
     replay(Session::with_device(recording, gpu, &args.out).into_diagnostic()?, verbosity)
 }
 

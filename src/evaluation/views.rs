@@ -59,11 +59,59 @@ pub struct ViewRecord {
     pub depth_l1_m: Option<f64>,
 }
 
+#[derive(Clone, Copy)]
 struct ViewFigures {
     psnr: f64,
     psnr_lit: f64,
     ssim: f64,
     depth_l1: Option<f64>,
+}
+
+/// Which protocols a view belongs to.
+#[derive(Clone, Copy)]
+struct ViewRole {
+    frame: usize,
+    is_keyframe: bool,
+    is_held_out: bool,
+}
+
+/// Means of the views so far, by protocol.
+#[derive(Default)]
+struct ProtocolMeans {
+    held_out: ImageMeans,
+    map_colors: ImageMeans,
+    all_frames: ImageMeans,
+    monogs: ImageMeans,
+}
+
+impl ProtocolMeans {
+    /// Counts a view in by its figures in the map's own colours and, where that is corrected, with its exposure. Returns the record of a
+    /// held-out view.
+    fn add(&mut self, role: ViewRole, own: ViewFigures, exposed: Option<ViewFigures>) -> Option<ViewRecord> {
+        self.all_frames.add(own.psnr, own.ssim, own.depth_l1);
+        if role.frame.is_multiple_of(MONOGS_EVERY) && !role.is_keyframe {
+            self.monogs.add(own.psnr_lit, own.ssim, own.depth_l1);
+        }
+        if !role.is_held_out {
+            return None;
+        }
+        if exposed.is_some() {
+            self.map_colors.add(own.psnr, own.ssim, own.depth_l1);
+        }
+        let f = exposed.unwrap_or(own);
+        self.held_out.add(f.psnr, f.ssim, f.depth_l1);
+        let psnr_db = Some(f.psnr).filter(|psnr| psnr.is_finite());
+        Some(ViewRecord { frame: role.frame, psnr_db, ssim: f.ssim, depth_l1_m: f.depth_l1 })
+    }
+
+    fn figures(&self) -> ImageProtocols {
+        ImageProtocols {
+            held_out: self.held_out.figures(),
+            held_out_map_colors: self.map_colors.figures(),
+            all_frames: self.all_frames.figures(),
+            monogs: self.monogs.figures(),
+        }
+    }
 }
 
 /// A map and the recording that it is compared with.
@@ -95,7 +143,7 @@ pub fn evaluate_views(
     let mut rasterizer = Rasterizer::new(gpu.clone())?;
     let mut on_gpu = GpuCloud::new(gpu, cloud.sh_degree, cloud.len())?;
     on_gpu.append(gpu, cloud)?;
-    let [mut held_out, mut map_colors, mut all_frames, mut monogs] = [ImageMeans::default(); 4];
+    let mut means = ProtocolMeans::default();
     for (batch, poses) in selection.poses.chunks(BATCH).enumerate() {
         on_view(batch * BATCH);
         let indices: Vec<usize> = poses.iter().map(|(index, _)| *index).collect();
@@ -118,29 +166,15 @@ pub fn evaluate_views(
             (index, rendered, recorded, in_map_colors, exposed)
         };
         let views: Vec<_> = views.into_par_iter().map(exposed).collect();
-        for (index, rendered, recorded, f, exposed) in views {
-            all_frames.add(f.psnr, f.ssim, f.depth_l1);
-            if index % MONOGS_EVERY == 0 && !selection.keyframes.contains(&index) {
-                monogs.add(f.psnr_lit, f.ssim, f.depth_l1);
-            }
-            if (selection.is_held_out)(index) {
-                if exposed.is_some() {
-                    map_colors.add(f.psnr, f.ssim, f.depth_l1);
-                }
-                let f = exposed.unwrap_or(f);
-                held_out.add(f.psnr, f.ssim, f.depth_l1);
-                let psnr_db = Some(f.psnr).filter(|psnr| psnr.is_finite());
-                let figures = ViewRecord { frame: index, psnr_db, ssim: f.ssim, depth_l1_m: f.depth_l1 };
+        for (frame, rendered, recorded, own, exposed) in views {
+            let is_keyframe = selection.keyframes.contains(&frame);
+            let role = ViewRole { frame, is_keyframe, is_held_out: (selection.is_held_out)(frame) };
+            if let Some(figures) = means.add(role, own, exposed) {
                 on_held_out(ComparedView { figures, recorded: recorded.color, rendered: to_rgb8(&rendered) });
             }
         }
     }
-    Ok(ImageProtocols {
-        held_out: held_out.figures(),
-        held_out_map_colors: map_colors.figures(),
-        all_frames: all_frames.figures(),
-        monogs: monogs.figures(),
-    })
+    Ok(means.figures())
 }
 
 fn compare(rendered: &Rendered, recorded: &RectifiedImage) -> ViewFigures {
@@ -164,4 +198,67 @@ pub fn to_rgb8(rendered: &Rendered) -> RgbImage {
         let p = rendered.color_depth[(y * rendered.width + x) as usize];
         Rgb([byte(p[0]), byte(p[1]), byte(p[2])])
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::Pinhole;
+    use crate::sequence::DepthImage;
+
+    const SIZE: u32 = 16;
+
+    fn figures(psnr: f64) -> ViewFigures {
+        ViewFigures { psnr, psnr_lit: psnr + 0.5, ssim: psnr / 100.0, depth_l1: None }
+    }
+
+    #[test]
+    fn a_view_counts_in_its_protocols() {
+        let mut means = ProtocolMeans::default();
+        let role = |frame, is_keyframe, is_held_out| ViewRole { frame, is_keyframe, is_held_out };
+        assert_eq!(means.add(role(0, true, false), figures(10.0), None), None);
+        assert_eq!(means.add(role(5, false, false), figures(20.0), None), None);
+        assert_eq!(means.add(role(6, false, false), figures(30.0), None), None);
+        let record = ViewRecord { frame: 8, psnr_db: Some(50.0), ssim: 0.5, depth_l1_m: None };
+        assert_eq!(means.add(role(8, false, true), figures(40.0), Some(figures(50.0))), Some(record));
+        let equal = means.add(role(16, false, true), figures(f64::INFINITY), None).unwrap();
+        assert_eq!((equal.frame, equal.psnr_db), (16, None));
+        let figures = means.figures();
+        let of = |f: Option<crate::evaluation::metrics::ImageFigures>| f.map(|f| (f.count, f.psnr_db));
+        assert_eq!(of(figures.all_frames), Some((5, None)));
+        assert_eq!(of(figures.monogs), Some((1, Some(20.5))), "frame 0 is a keyframe, the others are no fifth ones");
+        assert_eq!(of(figures.held_out_map_colors), Some((1, Some(40.0))), "where exposures are corrected");
+        assert_eq!(figures.held_out.map(|f| f.count), Some(2));
+    }
+
+    #[test]
+    fn a_render_is_compared_by_colour_and_expected_depth() {
+        let pixels = (SIZE * SIZE) as usize;
+        // Half covered at 1 m of depth's sum: 2 m. Beyond white counts as white.
+        let rendered = Rendered {
+            width: SIZE,
+            height: SIZE,
+            color_depth: vec![[1.5, 0.2, -0.5, 1.0]; pixels],
+            transmittance: vec![0.5; pixels],
+        };
+        let bytes = to_rgb8(&rendered);
+        assert!(bytes.dimensions() == (SIZE, SIZE) && bytes.pixels().all(|p| p.0 == [255, 51, 0]));
+        let pinhole = Pinhole { fx: 16.0, fy: 16.0, cx: 8.0, cy: 8.0, width: SIZE, height: SIZE };
+        let depth = DepthImage { width: SIZE, height: SIZE, metres: vec![2.5; pixels] };
+        let mut recorded = RectifiedImage { pinhole, color: bytes, depth: Some(depth) };
+        let f = compare(&rendered, &recorded);
+        assert!(f.psnr > 100.0 && f.psnr_lit > 100.0 && f.ssim > 0.999, "equal colours");
+        assert!((f.depth_l1.unwrap() - 0.5).abs() < 1e-6);
+        recorded.color.put_pixel(8, 8, Rgb([0, 51, 0]));
+        let f = compare(&rendered, &recorded);
+        assert!((f.psnr - 10.0 * f64::from(3 * SIZE * SIZE).log10()).abs() < 1e-3, "one channel of one pixel is off by one");
+        assert!(f.ssim < 0.9999);
+    }
+
+    #[test]
+    fn pixels_are_bytes_row_by_row() {
+        let color_depth = vec![[0.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
+        let image = to_rgb8(&Rendered { width: 2, height: 2, color_depth, transmittance: vec![0.0; 4] });
+        assert_eq!(image.into_raw(), [0, 0, 0, 255, 0, 0, 0, 255, 0, 0, 0, 255]);
+    }
 }

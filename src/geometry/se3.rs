@@ -8,8 +8,8 @@ use nalgebra::{Isometry3, Matrix3, Translation3, UnitQuaternion, Vector3, Vector
 /// A rigid motion; its action is `p_in_a = a_from_b * p_in_b`, metres.
 pub type Se3 = Isometry3<f64>;
 
-/// Below this angle (rad) the series expansions are exact to f64.
-const SMALL_ANGLE_RAD: f64 = 1e-5;
+/// Below this angle (rad) the series are exact to f64; far below it, the closed forms lose all digits to cancellation.
+const SMALL_ANGLE_RAD: f64 = 1e-2;
 
 /// The matrix of the cross product, `skew(a) * b = a × b`.
 pub fn skew(v: &Vector3<f64>) -> Matrix3<f64> {
@@ -36,9 +36,10 @@ fn left_jacobian(theta: &Vector3<f64>) -> Matrix3<f64> {
     let angle = theta.norm();
     let w = skew(theta);
     let (a, b) = if angle < SMALL_ANGLE_RAD {
-        (0.5 - angle * angle / 24.0, 1.0 / 6.0 - angle * angle / 120.0)
+        let square = angle * angle;
+        (0.5 - square / 24.0 + square * square / 720.0, 1.0 / 6.0 - square / 120.0 + square * square / 5040.0)
     } else {
-        ((1.0 - angle.cos()) / angle.powi(2), (angle - angle.sin()) / angle.powi(3))
+        (2.0 * ((0.5 * angle).sin() / angle).powi(2), (angle - angle.sin()) / angle.powi(3))
     };
     Matrix3::identity() + w * a + w * w * b
 }
@@ -47,9 +48,10 @@ fn left_jacobian_inverse(theta: &Vector3<f64>) -> Matrix3<f64> {
     let angle = theta.norm();
     let w = skew(theta);
     let c = if angle < SMALL_ANGLE_RAD {
-        1.0 / 12.0 + angle * angle / 720.0
+        let square = angle * angle;
+        1.0 / 12.0 + square / 720.0 + square * square / 30240.0
     } else {
-        (1.0 - angle * angle.sin() / (2.0 * (1.0 - angle.cos()))) / angle.powi(2)
+        (1.0 - 0.5 * angle / (0.5 * angle).tan()) / angle.powi(2)
     };
     Matrix3::identity() - w * 0.5 + w * w * c
 }
@@ -73,6 +75,17 @@ mod tests {
         fn tiny_rotations_keep_full_precision(t in prop::array::uniform3(-10.0f64..10.0), r in prop::array::uniform3(-1e-6f64..1e-6)) {
             let tau = Vector6::new(t[0], t[1], t[2], r[0], r[1], r[2]);
             prop_assert!((log(&exp(&tau)) - tau).norm() < 1e-12);
+        }
+    }
+
+    #[test]
+    fn no_angle_loses_precision() {
+        let axis = Vector3::new(0.2, -0.7, 0.5).normalize();
+        for angle in (0..120).map(|k| 1e-12 * 10f64.powf(0.1 * f64::from(k))) {
+            let theta = axis * angle;
+            let tau = Vector6::new(7.0, -3.0, 9.0, theta.x, theta.y, theta.z);
+            let error = (log(&exp(&tau)) - tau).norm();
+            assert!(error < 1e-13, "{angle}: {error}");
         }
     }
 

@@ -11,7 +11,8 @@ use crate::geometry::Se3;
 use crate::optimise::GaussianScore;
 use crate::render::Plan;
 
-/// A keyframe that moves by less than both was only refined, and optimisation takes its Gaussians along; a loop moves it further.
+/// A keyframe that has moved by less than both since its Gaussians did was only refined, and optimisation takes these along; a loop moves it
+/// further.
 const MIN_SHIFT_METRES: f64 = 0.01;
 const MIN_TURN_RAD: f64 = 0.5 * std::f64::consts::PI / 180.0;
 

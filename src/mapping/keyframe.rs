@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::KeyframeId;
 use super::exposure;
+use super::gaussian_stats;
 use super::plane_sweep::{self, SourceView};
 use super::refine_poses::{PoseRefinement, RefinePosesConfig};
 use crate::geometry::{Pinhole, Se3};
@@ -68,6 +69,8 @@ pub(super) struct MappedKeyframe {
     pub camera: ViewCamera,
     /// The tracker's camera_from_world, which the refinement goes out from.
     pub tracked_from_world: Se3,
+    /// camera_from_world at which its Gaussians were inserted, or to which they were last moved.
+    anchored_from_world: Se3,
     pub refinement: PoseRefinement,
     /// Exposure of the recorded image against the map; the kept image is corrected by it.
     pub exposure: Exposure,
@@ -97,6 +100,7 @@ pub(super) struct KeyframeState {
     pub id: KeyframeId,
     camera: ViewCamera,
     tracked_from_world: Se3,
+    anchored_from_world: Se3,
     refinement: PoseRefinement,
     exposure: Exposure,
     depth_metres: f64,
@@ -154,6 +158,7 @@ impl MappedKeyframe {
             id: keyframe.id,
             camera,
             tracked_from_world: camera.camera_from_world,
+            anchored_from_world: camera.camera_from_world,
             refinement: PoseRefinement::default(),
             exposure,
             depth_metres: image.median_depth_metres().unwrap_or(1.0),
@@ -169,6 +174,7 @@ impl MappedKeyframe {
             id: self.id,
             camera: self.camera,
             tracked_from_world: self.tracked_from_world,
+            anchored_from_world: self.anchored_from_world,
             refinement: self.refinement,
             exposure: self.exposure,
             depth_metres: self.depth_metres,
@@ -207,6 +213,7 @@ impl MappedKeyframe {
             id: state.id,
             camera: state.camera,
             tracked_from_world: state.tracked_from_world,
+            anchored_from_world: state.anchored_from_world,
             refinement: state.refinement,
             exposure: state.exposure,
             depth_metres: state.depth_metres,
@@ -217,8 +224,17 @@ impl MappedKeyframe {
         }))
     }
 
-    /// The tracker moved it; its refinement goes along.
-    pub fn track(&mut self, tracked_from_world: Se3) {
+    /// The tracker moved it. Returns the motion of its Gaussians, new_from_old, once what has added up is more than a refinement.
+    pub fn update_pose(&mut self, world_from_camera: &Se3) -> Option<Se3> {
+        let camera_from_world = world_from_camera.inverse();
+        self.track(camera_from_world);
+        let motion = gaussian_stats::motion(&self.anchored_from_world.inverse(), world_from_camera)?;
+        self.anchored_from_world = camera_from_world;
+        Some(motion)
+    }
+
+    /// At the tracker's pose; its refinement goes along.
+    fn track(&mut self, tracked_from_world: Se3) {
         self.tracked_from_world = tracked_from_world;
         self.camera.camera_from_world = self.refinement.refined_from_tracked * tracked_from_world;
     }

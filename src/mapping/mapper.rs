@@ -17,7 +17,7 @@ use serde::{Deserialize, Serialize};
 pub use refine::{FinalRefinement, RefineReport};
 pub use state::MapperState;
 
-use super::gaussian_stats::{self, GaussianStats};
+use super::gaussian_stats::GaussianStats;
 use super::keyframe::{DepthSource, MappedKeyframe};
 use super::plane_sweep::{self, SourceView};
 use super::refine_poses::RefinedPair;
@@ -167,8 +167,8 @@ impl Mapper {
         Ok(())
     }
 
-    /// Moves earlier keyframes to better poses, and with those that move far the Gaussians inserted from them; returns how many. Unknown
-    /// ids are those that were never sent to the mapper.
+    /// Moves earlier keyframes to better poses. The Gaussians inserted from a keyframe follow once its moves add up to more than a refinement;
+    /// returns how many did. Unknown ids are those that were never sent to the mapper.
     ///
     /// # Errors
     /// [`MappingError`] if a buffer does not fit or the device fails.
@@ -177,11 +177,7 @@ impl Mapper {
         let updates: BTreeMap<KeyframeId, &Se3> = updates.iter().map(|(id, pose)| (*id, pose)).collect();
         for keyframe in &mut self.keyframes {
             if let Some(world_from_camera) = updates.get(&keyframe.id) {
-                let old_world_from_camera = keyframe.tracked_from_world.inverse();
-                motions.extend(
-                    gaussian_stats::motion(&old_world_from_camera, world_from_camera).map(|motion| (keyframe.id, motion)),
-                );
-                keyframe.track(world_from_camera.inverse());
+                motions.extend(keyframe.update_pose(world_from_camera).map(|motion| (keyframe.id, motion)));
             }
         }
         let moved = self.stats.moved(&motions);

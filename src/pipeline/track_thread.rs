@@ -1,12 +1,14 @@
 //! The tracking thread: tracks frames and sends keyframes to the mapper.
 
+use std::collections::BTreeMap;
+
 use crossbeam::channel::{Receiver, Sender, TrySendError};
 
 use super::pose_feedback::PoseFeedbackReceiver;
 use super::progress::{TrackingProgress, guarded};
 use super::{PipelineError, Progress};
-use crate::geometry::{StampedPose, Trajectory};
-use crate::mapping::{DepthSource, Keyframe, MapperMessage, RightImage};
+use crate::geometry::{Se3, StampedPose, Trajectory};
+use crate::mapping::{DepthSource, Keyframe, KeyframeId, MapperMessage, RightImage};
 use crate::recording::Recording;
 use crate::run_folder::FrameRecord;
 use crate::sequence::{Frame, Rectifier, Sensor};
@@ -29,45 +31,63 @@ pub(super) struct KeyframeSender<'a> {
     sender: &'a Sender<MapperMessage>,
     real_time: bool,
     /// Real time: the newest keyframe that found the channel full.
-    waiting: Option<MapperMessage>,
+    waiting: Option<Box<Keyframe>>,
+    /// Real time: the newest poses that found the channel full.
+    waiting_poses: BTreeMap<KeyframeId, Se3>,
     deferred: usize,
 }
 
 impl<'a> KeyframeSender<'a> {
     pub fn new(sender: &'a Sender<MapperMessage>, real_time: bool) -> Self {
-        Self { sender, real_time, waiting: None, deferred: 0 }
+        Self { sender, real_time, waiting: None, waiting_poses: BTreeMap::new(), deferred: 0 }
     }
 
-    /// Sends a message; `false` if the mapper has closed the channel.
+    /// Sends a message; `false` if the mapper has closed the channel. In real time it waits in its turn while the channel is full: a keyframe
+    /// replaces one that waits, and poses those of the same keyframes.
     pub fn send(&mut self, message: MapperMessage) -> bool {
         if !self.real_time {
             return self.sender.send(message).is_ok();
         }
-        let is_keyframe = matches!(message, MapperMessage::Keyframe(_));
-        match self.sender.try_send(message) {
-            Ok(()) => true,
-            // A pose update that finds the channel full is followed by a newer one.
-            Err(TrySendError::Full(_)) if !is_keyframe => true,
-            Err(TrySendError::Full(message)) => {
-                self.deferred += usize::from(self.waiting.replace(message).is_some());
-                true
+        match message {
+            MapperMessage::PoseUpdate(poses) => self.waiting_poses.extend(poses),
+            MapperMessage::Keyframe(mut keyframe) => {
+                keyframe.world_from_camera = self.waiting_poses.remove(&keyframe.id).unwrap_or(keyframe.world_from_camera);
+                self.deferred += usize::from(self.waiting.replace(keyframe).is_some());
             }
-            Err(TrySendError::Disconnected(_)) => false,
+            points @ MapperMessage::Points(_) => return self.sender.send(points).is_ok(),
         }
+        self.retry()
     }
 
-    /// Sends the keyframe that waits, if any; `false` if the mapper has closed the channel.
+    /// Sends what waits, as far as there is room; `false` if the mapper has closed the channel.
     pub fn retry(&mut self) -> bool {
-        match self.waiting.take() {
-            Some(message) => self.send(message),
-            None => true,
+        if let Some(keyframe) = &mut self.waiting
+            && let Some(pose) = self.waiting_poses.remove(&keyframe.id)
+        {
+            keyframe.world_from_camera = pose;
         }
+        if !self.waiting_poses.is_empty() {
+            let poses = self.waiting_poses.iter().map(|(id, pose)| (*id, *pose)).collect();
+            match self.sender.try_send(MapperMessage::PoseUpdate(poses)) {
+                Ok(()) => self.waiting_poses.clear(),
+                Err(TrySendError::Full(_)) => return true,
+                Err(TrySendError::Disconnected(_)) => return false,
+            }
+        }
+        let Some(keyframe) = self.waiting.take() else { return true };
+        match self.sender.try_send(MapperMessage::Keyframe(keyframe)) {
+            Err(TrySendError::Full(MapperMessage::Keyframe(keyframe))) => self.waiting = Some(keyframe),
+            Err(TrySendError::Disconnected(_)) => return false,
+            _ => {}
+        }
+        true
     }
 
-    /// Sends the keyframe that waits, which no newer one replaces; returns the number of keyframes that the mapper never received.
+    /// Sends the keyframe that waits, which no newer one replaces; returns the number of keyframes that the mapper never received. Poses that
+    /// wait are part of the final pose update.
     pub fn finish(self) -> usize {
-        if let Some(message) = self.waiting {
-            let _ = self.sender.send(message);
+        if let Some(keyframe) = self.waiting {
+            let _ = self.sender.send(MapperMessage::Keyframe(keyframe));
         }
         self.deferred
     }
@@ -158,5 +178,47 @@ impl TrackSummary {
     /// The poses without their frame numbers.
     pub fn stamped(&self) -> Trajectory {
         Trajectory { poses: self.trajectory.iter().map(|(_, pose)| *pose).collect() }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use crossbeam::channel::bounded;
+    use image::RgbImage;
+
+    use super::*;
+    use crate::geometry::Pinhole;
+    use crate::sequence::RectifiedImage;
+
+    fn keyframe(id: KeyframeId) -> MapperMessage {
+        let pinhole = Pinhole { fx: 8.0, fy: 8.0, cx: 3.5, cy: 3.5, width: 8, height: 8 };
+        let image = RectifiedImage { pinhole, color: RgbImage::new(8, 8), depth: None };
+        let world_from_camera = Se3::identity();
+        let keyframe = Keyframe { id, world_from_camera, image, depth_source: DepthSource::Sensor, covisible: Vec::new() };
+        MapperMessage::Keyframe(Box::new(keyframe))
+    }
+
+    fn moved(metres: f64) -> Se3 {
+        Se3::translation(metres, 0.0, 0.0)
+    }
+
+    /// A loop moves each keyframe once: poses that find the channel full are sent later, the newest of each keyframe.
+    #[test]
+    fn poses_that_find_the_channel_full_are_sent_later() {
+        let (sender, messages) = bounded(1);
+        let mut channel = KeyframeSender::new(&sender, true);
+        assert!(channel.send(keyframe(0)));
+        assert!(channel.send(MapperMessage::PoseUpdate(vec![(0, moved(1.0)), (1, moved(2.0))])));
+        assert!(channel.send(keyframe(2)) && channel.send(keyframe(3)));
+        assert!(channel.send(MapperMessage::PoseUpdate(vec![(1, moved(3.0)), (3, moved(4.0))])));
+        assert!(matches!(messages.try_recv(), Ok(MapperMessage::Keyframe(k)) if k.id == 0));
+        assert!(channel.retry());
+        let Ok(MapperMessage::PoseUpdate(poses)) = messages.try_recv() else { panic!("poses come before the keyframe") };
+        assert_eq!(poses, [(0, moved(1.0)), (1, moved(3.0))]);
+        assert!(channel.retry());
+        assert!(matches!(messages.try_recv(), Ok(MapperMessage::Keyframe(k)) if k.id == 3 && k.world_from_camera == moved(4.0)));
+        assert_eq!(channel.finish(), 1, "keyframe 2 was replaced");
+        drop(messages);
+        assert!(!KeyframeSender::new(&sender, true).send(keyframe(4)));
     }
 }

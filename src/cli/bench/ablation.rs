@@ -59,7 +59,7 @@ impl Row {
 }
 
 pub(super) fn ablation(args: &AblationArgs) -> miette::Result<()> {
-    let recording = Recording::open(args.run.resolve()?).into_diagnostic()?;
+    let (recording, gpu) = args.run.open()?;
     let base = recording.config();
     let given = Variant { name: "as given".into(), settings: Vec::new() };
     let variants = if args.variants.is_empty() { std::slice::from_ref(&given) } else { &args.variants };
@@ -67,7 +67,6 @@ pub(super) fn ablation(args: &AblationArgs) -> miette::Result<()> {
     let configs: Vec<Config> =
         variants.iter().map(|v| base.with_settings(&v.settings)).collect::<Result<_, _>>().into_diagnostic()?;
     std::fs::create_dir_all(&args.run.out).into_diagnostic()?;
-    let gpu = Gpu::open(base.adapter.as_deref()).into_diagnostic()?;
     let log = TrackedLog::record(&recording, &Progress::default()).into_diagnostic()?;
     println!("| variant | steps/keyframe | mapping s | steps | Gaussians | held-out PSNR dB | SSIM | depth L1 cm |");
     println!("|---|---|---|---|---|---|---|---|");
