@@ -7,7 +7,6 @@ use serde::{Deserialize, Serialize};
 
 use crate::calibration::{BenchScene, StepRunner};
 use crate::config::Config;
-use crate::geometry::Pinhole;
 use crate::gpu::{AdapterSummary, Gpu, GpuError};
 use crate::recording::Recording;
 use crate::render::BlendForm;
@@ -96,7 +95,8 @@ const PIXELS_ON_INTEGRATED: u32 = 600_000;
 /// Share of the recorded resolution that is mapped where nothing chooses one: the largest at which an adapter of this kind takes about 0.1 s a
 /// step or less. A discrete GPU maps at the recorded resolution.
 pub fn default_scale(adapter: &AdapterSummary, recording: &Recording) -> f64 {
-    scale_within(most_pixels(&adapter.kind), &recording.sequence().camera.pinhole)
+    let pinhole = &recording.sequence().camera.pinhole;
+    scale_within(most_pixels(&adapter.kind), (pinhole.width, pinhole.height))
 }
 
 fn most_pixels(adapter_kind: &str) -> u32 {
@@ -108,15 +108,15 @@ fn most_pixels(adapter_kind: &str) -> u32 {
 }
 
 /// The largest scale with at most so many pixels, or the smallest that leaves [`LEAST_PIXELS`] on a side.
-fn scale_within(most_pixels: u32, recorded: &Pinhole) -> f64 {
+fn scale_within(most_pixels: u32, (width, height): (u32, u32)) -> f64 {
     let mut chosen = 1.0;
     for scale in SCALES {
-        let pinhole = recorded.scaled(scale);
-        if scale < 1.0 && pinhole.width.min(pinhole.height) < LEAST_PIXELS {
+        let [width, height] = [width, height].map(|side| (f64::from(side) * scale).round());
+        if scale < 1.0 && width.min(height) < f64::from(LEAST_PIXELS) {
             break;
         }
         chosen = scale;
-        if u64::from(pinhole.width) * u64::from(pinhole.height) <= u64::from(most_pixels) {
+        if width * height <= f64::from(most_pixels) {
             break;
         }
     }
@@ -153,12 +153,11 @@ mod tests {
 
     #[test]
     fn resolution_and_preset_follow_from_the_kind_of_adapter() {
-        let of = |width: u32, height: u32| Pinhole { fx: 500.0, fy: 500.0, cx: 0.0, cy: 0.0, width, height };
-        let on = |kind: &str, recorded: Pinhole| scale_within(most_pixels(kind), &recorded);
-        assert_eq!([of(160, 120), of(640, 480), of(1920, 1080)].map(|p| on("cpu", p)), [1.0, 0.5, 0.25]);
-        assert_eq!(on("cpu", of(4000, 150)), 0.75, "half the size would have too few rows");
-        assert_eq!((on("integrated", of(640, 480)), on("integrated", of(1920, 1080))), (1.0, 0.5));
-        assert_eq!(on("discrete", of(3840, 2160)), 1.0);
+        let on = |kind: &str, recorded: (u32, u32)| scale_within(most_pixels(kind), recorded);
+        assert_eq!([(160, 120), (640, 480), (1920, 1080)].map(|size| on("cpu", size)), [1.0, 0.5, 0.25]);
+        assert_eq!(on("cpu", (4000, 150)), 0.75, "half the size would have too few rows");
+        assert_eq!((on("integrated", (640, 480)), on("integrated", (1920, 1080))), (1.0, 0.5));
+        assert_eq!(on("discrete", (3840, 2160)), 1.0);
         let preset = |kind: &str| {
             let text = String::new;
             Preset::for_adapter(&AdapterSummary { name: text(), backend: text(), kind: kind.into(), driver: text() })

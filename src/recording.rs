@@ -6,7 +6,6 @@ use crate::config::{Config, ConfigError};
 use crate::evaluation::image::WINDOW as SSIM_WINDOW;
 use crate::evaluation::trajectory::MAX_TIME_DIFFERENCE_S;
 use crate::geometry::{Pinhole, Se3};
-use crate::mapping::MappingConfig;
 use crate::sequence::{Sensor, Sequence, SequenceError};
 
 /// A selection of a sequence's frames and the configuration that maps them. Immutable: a change makes a new value.
@@ -108,13 +107,16 @@ impl Recording {
         Ok(self)
     }
 
-    /// The recording mapped with other settings of the mapper.
+    /// The same frames with another configuration, which must select these frames.
     ///
     /// # Errors
     /// If a value is out of its range.
-    pub fn with_mapping(mut self, mapping: MappingConfig) -> Result<Self, RecordingError> {
-        self.config.mapping = mapping;
-        self.config.validate()?;
+    pub fn with_config(mut self, config: Config) -> Result<Self, RecordingError> {
+        config.validate()?;
+        // The selection's end is the recording's.
+        let frames = self.config.replay.frames;
+        self.config = config;
+        self.config.replay.frames = frames;
         Ok(self)
     }
 

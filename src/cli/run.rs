@@ -114,7 +114,7 @@ impl RunArgs {
         let gpu = Gpu::open(recording.config().adapter.as_deref()).into_diagnostic()?;
         if self.config.is_none() && self.preset.is_none() && !self.known_poses {
             let config = self.resolve(Some(Preset::for_adapter(&gpu.adapter)))?;
-            recording = recording.with_mapping(config.mapping).into_diagnostic()?;
+            recording = recording.with_config(config).into_diagnostic()?;
         }
         let scale = match self.preset {
             _ if self.map_scale.is_some() => None,
