@@ -68,6 +68,7 @@ mod tests {
         assert_eq!([at(0.0), at(1.0), at(3.0), at(9.0)], [0.1, 0.1, 0.3, 0.3]);
         assert!((at(1.5) - 0.15).abs() < 1e-6);
         assert_eq!(Exposures::default().at(1.0), Exposure::default());
+        assert!(Exposures::default().is_empty() && !exposures.is_empty());
     }
 
     #[test]
