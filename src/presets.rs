@@ -29,7 +29,7 @@ impl Preset {
     /// All presets, the fastest one first.
     pub const ALL: [Self; 4] = [Self::Realtime, Self::Balanced, Self::Quality, Self::Best];
 
-    /// What a run uses that chooses none: as many steps as an adapter of this kind takes in about the recording's duration.
+    /// What a run uses that chooses none: more steps on faster kinds of adapter.
     pub fn for_adapter(adapter: &AdapterSummary) -> Self {
         match adapter.kind.as_str() {
             "discrete" => Self::Best,
@@ -88,12 +88,18 @@ const PIXELS_PER_GAUSSIAN: u32 = 8;
 /// Least side of the mapped image, pixels.
 const LEAST_PIXELS: u32 = 96;
 
-/// Most pixels of the mapped image on an adapter of each kind: about 0.1 s a step or less.
+/// Most pixels of the mapped image, by kind of adapter.
 const PIXELS_ON_CPU: u32 = 150_000;
 const PIXELS_ON_INTEGRATED: u32 = 600_000;
 
-/// Share of the recorded resolution that is mapped where nothing chooses one: the largest at which an adapter of this kind takes about 0.1 s a
-/// step or less. A discrete GPU maps at the recorded resolution.
+/// The shares of a recorded size that leave [`LEAST_PIXELS`] on each side, the largest first; 1 always.
+fn usable_scales((width, height): (u32, u32)) -> impl Iterator<Item = f64> + Clone {
+    let usable = move |scale: &f64| *scale == 1.0 || (f64::from(width.min(height)) * scale).round() >= f64::from(LEAST_PIXELS);
+    SCALES.into_iter().take_while(usable)
+}
+
+/// Share of the recorded resolution that is mapped where nothing chooses one: within a number of pixels by kind of adapter. A discrete GPU
+/// maps at the recorded resolution.
 pub fn default_scale(adapter: &AdapterSummary, recording: &Recording) -> f64 {
     let pinhole = &recording.sequence().camera.pinhole;
     scale_within(most_pixels(&adapter.kind), (pinhole.width, pinhole.height))
@@ -107,20 +113,11 @@ fn most_pixels(adapter_kind: &str) -> u32 {
     }
 }
 
-/// The largest scale with at most so many pixels, or the smallest that leaves [`LEAST_PIXELS`] on a side.
-fn scale_within(most_pixels: u32, (width, height): (u32, u32)) -> f64 {
-    let mut chosen = 1.0;
-    for scale in SCALES {
-        let [width, height] = [width, height].map(|side| (f64::from(side) * scale).round());
-        if scale < 1.0 && width.min(height) < f64::from(LEAST_PIXELS) {
-            break;
-        }
-        chosen = scale;
-        if width * height <= f64::from(most_pixels) {
-            break;
-        }
-    }
-    chosen
+/// The largest usable scale with at most so many pixels, or the smallest usable one.
+fn scale_within(most_pixels: u32, recorded: (u32, u32)) -> f64 {
+    let pixels = |scale: f64| [recorded.0, recorded.1].map(|side| (f64::from(side) * scale).round()).iter().product::<f64>();
+    let scales = usable_scales(recorded);
+    scales.clone().find(|scale| pixels(*scale) <= f64::from(most_pixels)).or(scales.last()).unwrap_or(1.0)
 }
 
 /// Measures the largest share of the recorded resolution at which a training step is fast enough for real time.
@@ -129,11 +126,9 @@ fn scale_within(most_pixels: u32, (width, height): (u32, u32)) -> f64 {
 /// If the adapter fails.
 pub fn realtime_scale(gpu: &Arc<Gpu>, recording: &Recording) -> Result<f64, GpuError> {
     let mut chosen = 1.0;
-    for scale in SCALES {
-        let pinhole = recording.sequence().camera.pinhole.scaled(scale);
-        if scale < 1.0 && pinhole.width.min(pinhole.height) < LEAST_PIXELS {
-            break;
-        }
+    let recorded = recording.sequence().camera.pinhole;
+    for scale in usable_scales((recorded.width, recorded.height)) {
+        let pinhole = recorded.scaled(scale);
         chosen = scale;
         let size = (pinhole.width, pinhole.height);
         let gaussians = (size.0 * size.1 / PIXELS_PER_GAUSSIAN) as usize;

@@ -96,27 +96,17 @@ impl Recording {
         Ok(recording)
     }
 
-    /// The recording mapped at `map_scale`, a share of the recorded resolution.
-    ///
-    /// # Errors
-    /// If the scale is not above 0 and at most 1, or images become too small to be compared.
-    pub fn at_scale(mut self, map_scale: f64) -> Result<Self, RecordingError> {
-        self.config.map_scale = map_scale;
-        self.config.validate()?;
-        self.check_size()?;
-        Ok(self)
-    }
-
     /// The same frames with another configuration, which must select these frames.
     ///
     /// # Errors
-    /// If a value is out of its range.
+    /// If a value is out of its range, or images become too small to be compared.
     pub fn with_config(mut self, config: Config) -> Result<Self, RecordingError> {
         config.validate()?;
         // The selection's end is the recording's.
         let frames = self.config.replay.frames;
         self.config = config;
         self.config.replay.frames = frames;
+        self.check_size()?;
         Ok(self)
     }
 

@@ -108,27 +108,22 @@ fn parse_range(text: &str) -> Result<(usize, usize), String> {
 }
 
 impl RunArgs {
-    /// Opens the recording and the adapter. Without options and file, preset and mapping resolution follow from the kind of adapter.
+    /// Opens the recording and the adapter. Without a file, a preset and a mapping resolution that are not given follow from the adapter.
     pub fn open(&self) -> miette::Result<(Recording, Arc<Gpu>)> {
-        let mut recording = Recording::open(self.resolve(self.preset)?).into_diagnostic()?;
+        let recording = Recording::open(self.resolve(self.preset, None)?).into_diagnostic()?;
         let gpu = Gpu::open(recording.config().adapter.as_deref()).into_diagnostic()?;
-        if self.config.is_none() && self.preset.is_none() && !self.known_poses {
-            let config = self.resolve(Some(Preset::for_adapter(&gpu.adapter)))?;
-            recording = recording.with_config(config).into_diagnostic()?;
-        }
+        let free = self.config.is_none();
+        let preset = self.preset.or_else(|| (free && !self.known_poses).then(|| Preset::for_adapter(&gpu.adapter)));
         let scale = match self.preset {
             _ if self.map_scale.is_some() => None,
             Some(Preset::Realtime) => Some(presets::realtime_scale(&gpu, &recording).into_diagnostic()?),
-            _ if self.config.is_some() => None,
-            _ => Some(presets::default_scale(&gpu.adapter, &recording)),
+            _ => free.then(|| presets::default_scale(&gpu.adapter, &recording)),
         };
-        if let Some(scale) = scale {
-            recording = recording.at_scale(scale).into_diagnostic()?;
-        }
-        Ok((recording, gpu))
+        Ok((recording.with_config(self.resolve(preset, scale)?).into_diagnostic()?, gpu))
     }
 
-    fn resolve(&self, preset: Option<Preset>) -> miette::Result<Config> {
+    /// The configuration, with `scale` where no option gives the mapping resolution.
+    fn resolve(&self, preset: Option<Preset>, scale: Option<f64>) -> miette::Result<Config> {
         let mut config = match &self.config {
             Some(path) => Config::read_with(path, self.known_poses).into_diagnostic()?,
             None if self.known_poses => Config::offline(),
@@ -151,7 +146,7 @@ impl RunArgs {
         if let Some(camera) = &self.camera {
             sequence.camera = Some(if is_camera_file(camera) { absolute(camera)? } else { camera.clone() });
         }
-        config.map_scale = self.map_scale.unwrap_or(config.map_scale);
+        config.map_scale = self.map_scale.or(scale).unwrap_or(config.map_scale);
         config.map_format = self.format.unwrap_or(config.map_format);
         config.replay.every = self.every.unwrap_or(config.replay.every);
         config.replay.frames = self.frames.or(config.replay.frames);

@@ -234,9 +234,17 @@ mod tests {
 
     #[test]
     fn ssim_of_flat_images_is_the_luminance_term() {
-        let expected = (2.0 * 0.2 * 0.8 + C1) / (0.2 * 0.2 + 0.8 * 0.8 + C1);
+        let expected = (2.0 * 0.2 * 0.8 + 1e-4) / (0.2 * 0.2 + 0.8 * 0.8 + 1e-4);
         assert!((ssim(&gray(16, 12, 0.2), &gray(16, 12, 0.8)).unwrap() - expected).abs() < 1e-6);
         assert!((ssim(&gray(11, 11, 0.3), &gray(11, 11, 0.3)).unwrap() - 1.0).abs() < 1e-12);
+    }
+
+    #[test]
+    fn ssim_of_stripes_and_their_mean_is_the_contrast_term() {
+        let stripes: Vec<[f32; 3]> = (0..16 * 12).map(|i| [if i % 2 == 0 { 0.55 } else { 0.45 }; 3]).collect();
+        let stripes = ImageF32::new(16, 12, stripes).unwrap();
+        let expected = 9e-4 / (0.05 * 0.05 + 9e-4);
+        assert!((ssim(&stripes, &gray(16, 12, 0.5)).unwrap() - expected).abs() < 1e-5);
     }
 
     #[test]

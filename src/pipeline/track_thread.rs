@@ -50,10 +50,7 @@ impl<'a> KeyframeSender<'a> {
         }
         match message {
             MapperMessage::PoseUpdate(poses) => self.waiting_poses.extend(poses),
-            MapperMessage::Keyframe(mut keyframe) => {
-                keyframe.world_from_camera = self.waiting_poses.remove(&keyframe.id).unwrap_or(keyframe.world_from_camera);
-                self.deferred += usize::from(self.waiting.replace(keyframe).is_some());
-            }
+            MapperMessage::Keyframe(keyframe) => self.deferred += usize::from(self.waiting.replace(keyframe).is_some()),
             points @ MapperMessage::Points(_) => return self.sender.send(points).is_ok(),
         }
         self.retry()
