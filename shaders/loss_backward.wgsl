@@ -6,14 +6,14 @@
 @group(0) @binding(2) var<storage, read> state: array<vec2<f32>>;
 @group(0) @binding(3) var<storage, read> target_color: array<u32>;
 @group(0) @binding(4) var<storage, read> target_depth: array<f32>;
-// [3 channels, bordered H, bordered W], zero on the border.
+// [3 channels, bordered windows along y, along x], zero where there is no window.
 @group(0) @binding(5) var<storage, read> partials: array<vec4<f32>>;
 // [2, H, W] plane 0 (r, g, b, Σ w z), plane 1 (alpha; mean |colour error|, for the scores; -, -).
 @group(0) @binding(6) var<storage, read_write> image_gradients: array<vec4<f32>>;
 @group(0) @binding(7) var<uniform> unsampled: UnsampledTiles;
 
-// (by mean, by square, by product) of one channel filtered along rows: [26 rows, 16 columns].
-var<workgroup> rows: array<vec4<f32>, 416>;
+// (by mean, by square, by product) of one channel filtered along rows: [13 rows of windows, 16 columns].
+var<workgroup> rows: array<vec4<f32>, 208>;
 
 // A workgroup covers 16×16 pixels: two tiles, whose gradients are not needed if neither is sampled.
 @compute @workgroup_size(64)
@@ -43,18 +43,20 @@ fn main(
         wanted[k] = unpack4x8unorm(target_color[(y + k) * setup.width + x]);
     }
     for (var channel = 0u; channel < 3u; channel++) {
-        let stride = bordered(setup.width);
-        let corner = (channel * bordered(setup.height) + workgroup.y * 16u) * stride + workgroup.x * 16u;
+        let stride = bordered_windows(setup.width);
+        // The first windows that reach the first pixels.
+        let corner = vec2(workgroup.x * 8u + 1u - setup.phase_x, workgroup.y * 8u + 1u - setup.phase_y);
         workgroupBarrier();
-        for (var item = local; item < 104u; item += 64u) {
-            filter_row(corner + item / 4u * stride + item % 4u * 4u, item * 4u);
+        if local < 52u {
+            let begin = (channel * bordered_windows(setup.height) + corner.y + local / 4u) * stride + corner.x + local % 4u * 2u;
+            filter_row(begin, local * 4u);
         }
         workgroupBarrier();
-        let filtered = filter_column(row * 16u + column);
+        let filtered = filter_column(local / 16u * 32u + column);
         for (var k = 0u; k < end; k++) {
             let ssim = dot(filtered.at[k].xyz, vec3(1.0, 2.0 * rendered[k][channel], wanted[k][channel]));
             let l1 = sign(rendered[k][channel] - wanted[k][channel]);
-            gradient[k][channel] = ((1.0 - setup.ssim_weight) * l1 - setup.ssim_weight * ssim) * per_pixel / 3.0;
+            gradient[k][channel] = ((1.0 - setup.ssim_weight) * l1 - setup.ssim_weight * setup.pixels_per_window * ssim) * per_pixel / 3.0;
         }
     }
     for (var k = 0u; k < end; k++) {
@@ -72,24 +74,50 @@ fn main(
     }
 }
 
-// Four outputs along a row, from the partials at `at` on, to `rows[to]` on.
+// Four pixels of a row, from the windows at `at` on, to `rows[to]` on.
 fn filter_row(at: u32, to: u32) {
     var sum: Filtered;
-    add(&sum, partials[at + 0u], T0);
-    add(&sum, partials[at + 1u], T1);
-    add(&sum, partials[at + 2u], T2);
-    add(&sum, partials[at + 3u], T3);
-    add(&sum, partials[at + 4u], T4);
-    add(&sum, partials[at + 5u], T5);
-    add(&sum, partials[at + 6u], T6);
-    add(&sum, partials[at + 7u], T7);
-    add(&sum, partials[at + 8u], T8);
-    add(&sum, partials[at + 9u], T9);
-    add(&sum, partials[at + 10u], T10);
-    add(&sum, partials[at + 11u], T11);
-    add(&sum, partials[at + 12u], T12);
-    add(&sum, partials[at + 13u], T13);
+    if setup.phase_x == 0u {
+        add(&sum, partials[at + 0u], E0);
+        add(&sum, partials[at + 1u], E1);
+        add(&sum, partials[at + 2u], E2);
+        add(&sum, partials[at + 3u], E3);
+        add(&sum, partials[at + 4u], E4);
+        add(&sum, partials[at + 5u], E5);
+        add(&sum, partials[at + 6u], E6);
+    } else {
+        add(&sum, partials[at + 0u], O0);
+        add(&sum, partials[at + 1u], O1);
+        add(&sum, partials[at + 2u], O2);
+        add(&sum, partials[at + 3u], O3);
+        add(&sum, partials[at + 4u], O4);
+        add(&sum, partials[at + 5u], O5);
+        add(&sum, partials[at + 6u], O6);
+    }
     for (var k = 0u; k < 4u; k++) {
         rows[to + k] = sum.at[k];
     }
+}
+
+// Four pixels of a column, from the row of windows at `at` on.
+fn filter_column(at: u32) -> Filtered {
+    var sum: Filtered;
+    if setup.phase_y == 0u {
+        add(&sum, rows[at + 0u], E0);
+        add(&sum, rows[at + 16u], E1);
+        add(&sum, rows[at + 32u], E2);
+        add(&sum, rows[at + 48u], E3);
+        add(&sum, rows[at + 64u], E4);
+        add(&sum, rows[at + 80u], E5);
+        add(&sum, rows[at + 96u], E6);
+    } else {
+        add(&sum, rows[at + 0u], O0);
+        add(&sum, rows[at + 16u], O1);
+        add(&sum, rows[at + 32u], O2);
+        add(&sum, rows[at + 48u], O3);
+        add(&sum, rows[at + 64u], O4);
+        add(&sum, rows[at + 80u], O5);
+        add(&sum, rows[at + 96u], O6);
+    }
+    return sum;
 }

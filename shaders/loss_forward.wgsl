@@ -8,7 +8,7 @@
 // [H, W] the keyframe: 8-bit RGBA, and sensor depth in metres (0: not measured).
 @group(0) @binding(3) var<storage, read> target_color: array<u32>;
 @group(0) @binding(4) var<storage, read> target_depth: array<f32>;
-// [3 channels, bordered H, bordered W] ∂SSIM/∂(mean, mean square, mean product), zero on the border.
+// [3 channels, bordered windows along y, along x] ∂SSIM/∂(mean, mean square, mean product), zero where there is no window.
 @group(0) @binding(5) var<storage, read_write> partials: array<vec4<f32>>;
 // [tiles] sums of |colour error|, SSIM, |depth error|, squared colour error; a tile left out keeps those it had.
 @group(0) @binding(6) var<storage, read_write> loss_sums: array<vec4<f32>>;
@@ -17,18 +17,18 @@
 const C1: f32 = 0.0001;
 const C2: f32 = 0.0009;
 
-// Filtered along rows: [3 channels, 18 rows, 16 columns].
-var<workgroup> rows: array<vec4<f32>, 864>;
+// Filtered along rows: [3 channels, 17 rows, 8 windows].
+var<workgroup> rows: array<vec4<f32>, 408>;
 var<workgroup> sums: array<vec4<f32>, 32>;
 
 struct Ssim {
-    value: vec4<f32>,
-    by_mean: vec4<f32>,
-    by_square: vec4<f32>,
-    by_product: vec4<f32>,
+    value: vec3<f32>,
+    by_mean: vec3<f32>,
+    by_square: vec3<f32>,
+    by_product: vec3<f32>,
 }
 
-// A workgroup covers a tile, 16×8 pixels. Windows around the pixels of a tile that is left out do not count.
+// A workgroup covers a tile, 16×8 pixels, and an invocation one window and four pixels. Windows of a tile that is left out do not count.
 @compute @workgroup_size(32)
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
@@ -37,36 +37,35 @@ fn main(
 ) {
     let first = vec2(workgroup.x * 16u, workgroup.y * 8u);
     let tile = workgroup.y * workgroups.x + workgroup.x;
+    let window = vec2(local % 8u, local / 8u);
+    let stride = bordered_windows(setup.width);
+    let plane = stride * bordered_windows(setup.height);
+    let to = (first.y / 2u + window.y + WINDOW_BORDER) * stride + first.x / 2u + window.x + WINDOW_BORDER;
     if is_bit_set(unsampled.bits[tile / 128u % 1024u], tile) {
-        clear_partials(first, local);
+        partials[to] = vec4(0.0);
+        partials[plane + to] = vec4(0.0);
+        partials[2u * plane + to] = vec4(0.0);
         return;
     }
-    for (var item = local; item < 72u; item += 32u) {
-        filter_row(first, item / 4u, item % 4u * 4u);
+    for (var item = local; item < 34u; item += 32u) {
+        filter_row(first, item / 2u, item % 2u * 4u);
     }
     workgroupBarrier();
-    // Four pixels of one column.
-    let column = local % 16u;
-    let row = local / 16u * 4u;
-    let x = first.x + column;
-    let y = first.y + row;
-    let ssim = array<Ssim, 3>(
-        ssim_of(filter_column(row * 16u + column)),
-        ssim_of(filter_column(288u + row * 16u + column)),
-        ssim_of(filter_column(576u + row * 16u + column)),
-    );
-    let stride = bordered(setup.width);
-    let plane = stride * bordered(setup.height);
+    let at = window.y * 16u + window.x;
+    let ssim = ssim_of(filter_column(at), filter_column(136u + at), filter_column(272u + at));
+    let is_inside = first.x + 2u * window.x + setup.phase_x < setup.width && first.y + 2u * window.y + setup.phase_y < setup.height;
+    let weight = select(0.0, 1.0, is_inside);
+    for (var channel = 0u; channel < 3u; channel++) {
+        partials[channel * plane + to] = weight * vec4(ssim.by_mean[channel], ssim.by_square[channel], ssim.by_product[channel], 0.0);
+    }
     var sum = vec4(0.0);
+    sum.y = weight * setup.pixels_per_window * (ssim.value.x + ssim.value.y + ssim.value.z);
+    // Four pixels of one column.
+    let x = first.x + local % 16u;
+    let y = first.y + local / 16u * 4u;
     for (var k = 0u; k < 4u; k++) {
         if x >= setup.width || y + k >= setup.height {
             continue;
-        }
-        let to = (y + k + RADIUS) * stride + x + RADIUS;
-        for (var channel = 0u; channel < 3u; channel++) {
-            let s = ssim[channel];
-            partials[channel * plane + to] = vec4(s.by_mean[k], s.by_square[k], s.by_product[k], 0.0);
-            sum.y += s.value[k];
         }
         let index = (y + k) * setup.width + x;
         let rendered = color_depth[index];
@@ -87,20 +86,6 @@ fn main(
     }
     if local == 0u {
         loss_sums[tile] = sums[0];
-    }
-}
-
-fn clear_partials(first: vec2<u32>, local: u32) {
-    let stride = bordered(setup.width);
-    let plane = stride * bordered(setup.height);
-    for (var i = local; i < 128u; i += 32u) {
-        let pixel = first + vec2(i % 16u, i / 16u);
-        if pixel.x < setup.width && pixel.y < setup.height {
-            let to = (pixel.y + RADIUS) * stride + pixel.x + RADIUS;
-            partials[to] = vec4(0.0);
-            partials[plane + to] = vec4(0.0);
-            partials[2u * plane + to] = vec4(0.0);
-        }
     }
 }
 
@@ -127,10 +112,10 @@ fn add_pixel(
     add(blue, quantities(rendered.z, wanted.z), taps);
 }
 
-// Four outputs of one row of the tile's border and inside, from column `column` on.
+// Four windows of one row of pixels, from window `column` on.
 fn filter_row(first: vec2<u32>, row: u32, column: u32) {
-    let x = i32(first.x + column) - i32(RADIUS);
-    let y = i32(first.y + row) - i32(RADIUS);
+    let x = i32(first.x + setup.phase_x + 2u * column) - i32(RADIUS);
+    let y = i32(first.y + setup.phase_y + row) - i32(RADIUS);
     var red: Filtered;
     var green: Filtered;
     var blue: Filtered;
@@ -148,23 +133,37 @@ fn filter_row(first: vec2<u32>, row: u32, column: u32) {
     add_pixel(x + 11, y, &red, &green, &blue, T11);
     add_pixel(x + 12, y, &red, &green, &blue, T12);
     add_pixel(x + 13, y, &red, &green, &blue, T13);
-    let to = row * 16u + column;
+    add_pixel(x + 14, y, &red, &green, &blue, T14);
+    add_pixel(x + 15, y, &red, &green, &blue, T15);
+    add_pixel(x + 16, y, &red, &green, &blue, T16);
+    let to = row * 8u + column;
     for (var k = 0u; k < 4u; k++) {
         rows[to + k] = red.at[k];
-        rows[288u + to + k] = green.at[k];
-        rows[576u + to + k] = blue.at[k];
+        rows[136u + to + k] = green.at[k];
+        rows[272u + to + k] = blue.at[k];
     }
 }
 
-fn ssim_of(m: Filtered) -> Ssim {
-    let mean_x = vec4(m.at[0].x, m.at[1].x, m.at[2].x, m.at[3].x);
-    let mean_y = vec4(m.at[0].y, m.at[1].y, m.at[2].y, m.at[3].y);
-    let squares = vec4(m.at[0].z, m.at[1].z, m.at[2].z, m.at[3].z);
-    let product = vec4(m.at[0].w, m.at[1].w, m.at[2].w, m.at[3].w);
+// A window of one channel, from the first of its rows on.
+fn filter_column(at: u32) -> vec4<f32> {
+    return W0 * (rows[at] + rows[at + 80u])
+        + W1 * (rows[at + 8u] + rows[at + 72u])
+        + W2 * (rows[at + 16u] + rows[at + 64u])
+        + W3 * (rows[at + 24u] + rows[at + 56u])
+        + W4 * (rows[at + 32u] + rows[at + 48u])
+        + W5 * rows[at + 40u];
+}
+
+// Of the three channels, which are the lanes.
+fn ssim_of(red: vec4<f32>, green: vec4<f32>, blue: vec4<f32>) -> Ssim {
+    let mean_x = vec3(red.x, green.x, blue.x);
+    let mean_y = vec3(red.y, green.y, blue.y);
+    let squares = vec3(red.z, green.z, blue.z);
+    let product = vec3(red.w, green.w, blue.w);
     // Rounding can make the sum of the variances negative; it is then a constant 0.
     let means = mean_x * mean_x + mean_y * mean_y;
-    let variances = max(squares - means, vec4(0.0));
-    let free = select(vec4(0.0), vec4(1.0), squares > means);
+    let variances = max(squares - means, vec3(0.0));
+    let free = select(vec3(0.0), vec3(1.0), squares > means);
     let a1 = 2.0 * mean_x * mean_y + C1;
     let a2 = 2.0 * (product - mean_x * mean_y) + C2;
     let b1 = 1.0 / (means + C1);

@@ -19,9 +19,9 @@ pub enum Preset {
     Realtime,
     /// The defaults.
     Balanced,
-    /// More steps, denser insertion, and all tiles in every step.
+    /// More epochs at the end, and denser insertion.
     Quality,
-    /// Few steps a keyframe, and consolidation over all keyframes: online sessions, and 150 epochs at the end.
+    /// The same with 150 epochs at the end.
     Best,
 }
 
@@ -58,24 +58,18 @@ impl Preset {
                 mapping.tile_sampling.min_share = 1.0;
             }
             Self::Balanced => {}
-            // All tiles gain more than additional steps of the same duration.
-            Self::Quality => {
-                mapping.iterations_per_keyframe = 40;
-                mapping.tile_sampling.min_share = 1.0;
-                mapping.insertion.detail = 0.04;
-                mapping.density.multi_view.min_contribution = 0.5;
-            }
-            // A step on a complete set of views gains more than one whose successors undo it: insertion and exposure need few.
-            Self::Best => {
-                mapping.iterations_per_keyframe = 10;
-                mapping.refine.growth = 1.0;
-                mapping.refine.session_epochs = 3;
-                mapping.refine.final_epochs = 150;
-                mapping.refine.half_size_share = 0.0;
-                mapping.refine.all_tiles = true;
-            }
+            Self::Quality => refined(config, 60),
+            Self::Best => refined(config, 150),
         }
     }
+}
+
+/// Denser insertion, less pruning, and so many epochs at the end.
+fn refined(config: &mut Config, final_epochs: usize) {
+    let mapping = &mut config.mapping;
+    mapping.refine.final_epochs = final_epochs;
+    mapping.insertion.detail = 0.04;
+    mapping.density.multi_view.min_contribution = 0.5;
 }
 
 /// Shares of the recorded resolution that real time may choose.
@@ -169,12 +163,9 @@ mod tests {
             config
         };
         assert_eq!(of(Preset::Balanced), Config::default());
-        assert!(of(Preset::Best).mapping.refine.final_epochs > 0);
-        let (realtime, quality) = (of(Preset::Realtime), of(Preset::Quality));
-        assert!(realtime.replay.real_time && realtime.mapping.yields_to_keyframes);
-        assert!(
-            !quality.replay.real_time
-                && quality.mapping.iterations_per_keyframe > Config::default().mapping.iterations_per_keyframe
-        );
+        let epochs = [Preset::Balanced, Preset::Quality, Preset::Best].map(|preset| of(preset).mapping.refine.final_epochs);
+        assert!(epochs.is_sorted_by(|fewer, more| fewer < more), "{epochs:?}");
+        let live = Preset::ALL.map(|preset| (of(preset).replay.real_time, of(preset).mapping.yields_to_keyframes));
+        assert_eq!(live, [(true, true), (false, false), (false, false), (false, false)]);
     }
 }

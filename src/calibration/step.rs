@@ -186,8 +186,9 @@ fn floors(work: &Work, bench: &StepBench, rates: &Rates) -> BTreeMap<&'static st
     let floor = |bytes: f64, flops: f64| 1e3 * (bytes / rates.bytes_per_s).max(flops / rates.flops_per_s);
     let (depth_passes, tile_passes) = (4.0, if work.tiles < 256 { 1.0 } else { 2.0 });
     let planes = 3.0 + coefficients;
-    // Separable 11-tap filters over rows and columns: five quantities forward, three backward, on three channels.
-    let taps = 2.0 * 2.0 * 11.0 * 3.0 * pixels;
+    // Separable 11-tap filters for a quarter of the windows: half of the columns in half of the rows, then half of these rows; five quantities
+    // forward, three backward, on three channels.
+    let taps = 2.0 * (0.5 + 0.25) * 11.0 * 3.0 * pixels;
     BTreeMap::from([
         ("project_forward", floor(n * (16.0 * (2.0 + coefficients) + 20.0) + visible * 64.0, n * 150.0)),
         ("sort_count_digits", floor(4.0 * (depth_passes * visible + tile_passes * intersections), 0.0)),
@@ -195,8 +196,8 @@ fn floors(work: &Work, bench: &StepBench, rates: &Rates) -> BTreeMap<&'static st
         ("tile_lists", floor(visible * 2.0 * 40.0 + intersections * 12.0, 2.0 * intersections * 40.0)),
         ("tile_ranges", floor(intersections * 4.0, 0.0)),
         ("rasterize_forward", floor(intersections * 56.0 + pixels * 24.0, evaluations * 11.0 + blended * 24.0)),
-        ("loss_forward", floor(pixels * (20.0 + 48.0 + 12.0), taps * 5.0)),
-        ("loss_backward", floor(pixels * (20.0 + 48.0 + 12.0 + 32.0), taps * 3.0)),
+        ("loss_forward", floor(pixels * (20.0 + 12.0 + 12.0), taps * 5.0)),
+        ("loss_backward", floor(pixels * (20.0 + 12.0 + 12.0 + 32.0), taps * 3.0)),
         (bench.form.backward_stage(), floor(intersections * 104.0 + pixels * 56.0, back * 11.0 + blended * 70.0)),
         ("project_backward_adam", floor(intersections * 48.0 + visible * planes * 16.0 * 6.0, visible * (400.0 + planes * 60.0))),
     ])

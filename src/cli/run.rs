@@ -70,10 +70,13 @@ pub struct RunArgs {
     /// Most GPU memory that the mapper may use, e.g. 500M or 2G.
     #[arg(long, value_parser = parse_bytes)]
     max_gpu_memory: Option<u64>,
+    /// Most host memory for images of keyframes that left the GPU, e.g. 500M or 2G; a temporary file holds the rest.
+    #[arg(long, value_parser = parse_bytes)]
+    max_host_memory: Option<u64>,
     /// Keep a checkpoint after every so many keyframes (and rounds of a refinement), for `keysplat resume`.
     #[arg(long, value_name = "N")]
     checkpoint_every: Option<usize>,
-    /// Set any value of the configuration, e.g. --set mapping.iterations_per_keyframe=20 (may be given again).
+    /// Set any value of the configuration, e.g. --set mapping.refine.final_epochs=40 (may be given again).
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
 }
@@ -156,6 +159,7 @@ impl RunArgs {
         config.mapping.refine.seconds = self.time.or(config.mapping.refine.seconds);
         config.mapping.limits.max_gaussians = self.max_gaussians.or(config.mapping.limits.max_gaussians);
         config.mapping.limits.max_gpu_bytes = self.max_gpu_memory.or(config.mapping.limits.max_gpu_bytes);
+        config.mapping.limits.max_host_bytes = self.max_host_memory.unwrap_or(config.mapping.limits.max_host_bytes);
         config.with_settings(&self.set).into_diagnostic()
     }
 }

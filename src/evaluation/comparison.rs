@@ -50,3 +50,43 @@ impl Comparison {
         Self { poses, truth: path, views: Vec::new() }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::evaluation::trajectory::{Alignment, evaluate_trajectory};
+    use crate::geometry::Se3;
+
+    fn path(points: &[(f64, [f64; 3])]) -> Trajectory {
+        let pose = |&(timestamp_s, [x, y, z]): &(f64, [f64; 3])| StampedPose {
+            timestamp_s,
+            world_from_camera: Se3::translation(x, y, z),
+        };
+        Trajectory { poses: points.iter().map(pose).collect() }
+    }
+
+    #[test]
+    fn a_comparison_is_in_the_frame_of_the_truth() {
+        let truth = path(&[
+            (-1.0, [9.0; 3]),
+            (0.0, [0.0, 0.0, 0.0]),
+            (1.0, [1.0, 0.0, 0.0]),
+            (2.0, [1.0, 2.0, 0.0]),
+            (3.0, [0.0, 2.0, 3.0]),
+            (4.0, [9.0; 3]),
+        ]);
+        let shifted: Vec<_> = truth.poses[1..5]
+            .iter()
+            .map(|p| (p.timestamp_s, p.world_from_camera.translation.vector.add_scalar(5.0).into()))
+            .collect();
+        let estimate = path(&[&shifted[..3], &[(2.5, [7.0; 3])], &shifted[3..]].concat());
+        let errors = evaluate_trajectory(&truth, &estimate, Alignment::Rigid).unwrap();
+        let found = Comparison::of(&estimate, Some((&truth, &errors)));
+        assert_eq!(found.truth, [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 2.0, 0.0], [0.0, 2.0, 3.0]]);
+        assert_eq!(found.poses.iter().map(|p| p.error_m.is_some()).collect::<Vec<_>>(), [true, true, true, false, true]);
+        assert!(found.poses.iter().filter_map(|p| p.error_m).all(|error| error < 1e-9), "{found:?}");
+        let alone = Comparison::of(&estimate, None);
+        assert_eq!((alone.poses[3].position, alone.poses[3].error_m), ([7.0; 3], None));
+        assert!(alone.truth.is_empty() && alone.poses.len() == 5);
+    }
+}

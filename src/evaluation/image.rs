@@ -258,4 +258,33 @@ mod tests {
         let image = ImageF32::new(1, 1, vec![[-0.5, 1.5, f32::NAN]]).unwrap();
         assert_eq!(image.clamped().pixels, [[0.0, 1.0, 0.0]]);
     }
+
+    #[test]
+    fn ssim_is_that_of_its_definition() {
+        let mut rng = fastrand::Rng::with_seed(5);
+        let (width, height) = (15, 14);
+        let mut noise = || {
+            let pixels = (0..width * height).map(|_| [rng.f32(), rng.f32(), rng.f32()]).collect();
+            ImageF32::new(width, height, pixels).unwrap()
+        };
+        let (a, b) = (noise(), noise());
+        let weight = |d: usize| (-0.5 * ((d as f64 - 5.0) / 1.5).powi(2)).exp();
+        let norm: f64 = (0..11).map(weight).sum::<f64>().powi(2);
+        let mut sum = 0.0;
+        for (channel, y, x) in (0..3).flat_map(|c| (0..height - 10).flat_map(move |y| (0..width - 10).map(move |x| (c, y, x)))) {
+            // Means of a, b, a², b² and a b over the window.
+            let mut m = [0.0; 5];
+            for (v, u) in (0..11).flat_map(|v| (0..11).map(move |u| (v, u))) {
+                let at = |image: &ImageF32| f64::from(image.pixels[(y + v) * width + x + u][channel]);
+                let (p, q) = (at(&a), at(&b));
+                let values = [p, q, p * p, q * q, p * q];
+                m.iter_mut().zip(values).for_each(|(m, value)| *m += weight(u) * weight(v) / norm * value);
+            }
+            let covariances = [m[2] - m[0] * m[0], m[3] - m[1] * m[1], m[4] - m[0] * m[1]];
+            sum += (2.0 * m[0] * m[1] + 1e-4) * (2.0 * covariances[2] + 9e-4)
+                / ((m[0] * m[0] + m[1] * m[1] + 1e-4) * (covariances[0] + covariances[1] + 9e-4));
+        }
+        let expected = sum / (3 * (width - 10) * (height - 10)) as f64;
+        assert!((ssim(&a, &b).unwrap() - expected).abs() < 1e-9);
+    }
 }

@@ -48,8 +48,10 @@ mod tests {
 
     #[cfg(target_os = "linux")]
     #[test]
-    fn this_process_has_used_memory() {
+    fn this_process_uses_memory_on_some_processor() {
         let big = std::hint::black_box(vec![1u8; 32 << 20]);
-        assert!(peak_host_bytes().unwrap() > big.len() as u64);
+        assert!(peak_host_bytes().unwrap() > big.len() as u64 && host_bytes().unwrap() > big.len() as u64);
+        assert_eq!(cpu_name(), parse_cpu_name(&std::fs::read_to_string("/proc/cpuinfo").unwrap()));
+        assert_ne!(cpu_name().as_deref(), Some(""));
     }
 }

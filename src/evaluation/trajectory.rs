@@ -272,4 +272,59 @@ mod tests {
         let still = [Vector3::zeros(); 4];
         assert_eq!(align(&still, &still, Alignment::Similarity), Err(AlignmentError::NoScale));
     }
+
+    #[test]
+    fn each_pose_of_the_shorter_trajectory_is_paired() {
+        let pairs = |truth: &[f64], estimate: &[f64]| -> Vec<(usize, usize)> {
+            let (truth, estimate) = (path(truth.iter().copied()), path(estimate.iter().copied()));
+            associate(&truth, &estimate, 0.02).iter().map(|p| (p.truth, p.estimate)).collect()
+        };
+        assert_eq!(pairs(&[0.0, 0.1], &[0.0, 0.01, 0.1]), [(0, 0), (1, 2)]);
+        assert_eq!(pairs(&[0.0, 0.01, 0.1], &[0.0, 0.1]), [(0, 0), (2, 1)]);
+        assert_eq!(pairs(&[0.0, 0.01], &[0.0, 0.002]), [(0, 0), (0, 1)], "of equal lengths the estimate counts as the shorter");
+    }
+
+    #[test]
+    fn the_median_error_is_that_of_the_middle_pose() {
+        // Far out, the poses fix the alignment; the errors are 0 to 4 mm, apart from what the alignment takes.
+        let truth = path((0..9).map(f64::from));
+        let mut estimate = truth.clone();
+        for (i, pose) in estimate.poses.iter_mut().enumerate() {
+            pose.world_from_camera.translation.vector.y += 0.001 * (i / 2) as f64 * if i % 2 == 0 { 1.0 } else { -1.0 };
+        }
+        let errors = evaluate_trajectory(&truth, &estimate, Alignment::Rigid).unwrap();
+        let residual = |i: usize| {
+            let moved = moved(&errors.alignment, &estimate.poses[i].world_from_camera.translation.vector);
+            (moved - truth.poses[i].world_from_camera.translation.vector).norm()
+        };
+        let mut residuals: Vec<f64> = (0..9).map(residual).collect();
+        residuals.sort_by(f64::total_cmp);
+        assert_eq!((errors.ate_median_m, errors.ate_max_m), (residuals[4], residuals[8]));
+        assert!(residuals[4] > residuals[1] && residuals[4] < residuals[8]);
+    }
+
+    #[test]
+    fn rotation_is_divided_by_frames_and_seconds() {
+        // The estimate turns by half a degree a frame of 0.1 s, and every other frame has no truth. One stamp is out of step.
+        let turned = |t: f64| StampedPose {
+            timestamp_s: t,
+            world_from_camera: se3::exp(&Vector6::new(0.0, 0.0, 0.0, 0.0, 0.0, (5.0 * t).to_radians())),
+        };
+        let still = |t: f64| StampedPose { timestamp_s: t, world_from_camera: Se3::identity() };
+        let mut estimate = Trajectory { poses: (0..41).map(|i| turned(0.1 * f64::from(i))).collect() };
+        estimate.poses.push(turned(14.0));
+        let truth = Trajectory { poses: (0..41).step_by(2).map(|i| still(0.1 * f64::from(i))).collect() };
+        let errors = evaluate_trajectory(&truth, &estimate, Alignment::Rigid).unwrap().rpe;
+        assert!((errors.rot_deg_per_step - 1.0).abs() < 1e-9, "{errors:?}");
+        assert!((errors.rot_deg_per_frame - 0.5).abs() < 1e-9, "{errors:?}");
+        assert!((errors.rot_deg_per_s - 5.0).abs() < 1e-9, "{errors:?}");
+    }
+
+    #[test]
+    fn a_pose_of_the_truth_that_serves_twice_is_no_step() {
+        let truth = path([0.0, 0.1, 0.2, 0.3]);
+        let estimate = path([0.0, 0.1, 0.11, 0.2]);
+        let errors = evaluate_trajectory(&truth, &estimate, Alignment::Rigid).unwrap();
+        assert_eq!((errors.pairs, errors.rpe.steps), (4, 2));
+    }
 }

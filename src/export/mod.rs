@@ -233,7 +233,9 @@ mod tests {
 
     #[test]
     fn formats_are_known_by_name_and_extension() {
-        assert_eq!(MapFormat::all().len(), FORMATS.len());
+        let names = |formats: &[MapFormat]| formats.iter().map(|format| format.name()).collect::<Vec<_>>();
+        assert_eq!(names(MapFormat::all()), names(&FORMATS));
+        assert_eq!(names(<MapFormat as clap::ValueEnum>::value_variants()), names(&FORMATS));
         assert_eq!((MapFormat::default().name(), MapFormat::default().extension()), ("ply", "ply"));
         assert_eq!(MapFormat::by_name("xyz"), None);
         for unknown in ["map", "map.xyz", "ply"] {

@@ -162,3 +162,35 @@ fn an_empty_map_is_a_file_too() {
     let bytes = encode(&GaussianCloud::new(ShDegree::default())).unwrap();
     assert!(read_bytes(&bytes).unwrap().is_empty());
 }
+
+#[test]
+fn quaternions_of_unit_length_keep_their_bits() {
+    let almost = Quat::from_xyzw(0.5, 0.5, 0.5, 0.5 + f32::EPSILON / 2.0);
+    assert_eq!(unit(almost), almost.to_array());
+    assert_eq!(unit(Quat::from_xyzw(0.0, 1.2, 0.0, 1.6)), [0.0, 0.6, 0.0, 0.8]);
+    assert_eq!(unit(Quat::from_xyzw(0.0, 0.0, 0.0, 0.0)), [0.0, 0.0, 0.0, 1.0]);
+}
+
+#[test]
+fn headers_are_refused_at_the_line_that_is_wrong() {
+    let bytes = encode(&cloud(ShDegree::default(), 1)).unwrap();
+    let (header, _) = split(&bytes);
+    let lines = header.lines().count();
+    let without_format = with_header(&bytes, |h| h.replace("format binary_little_endian 1.0\n", ""));
+    assert!(refusal(&without_format).contains(&format!("map.ply:{}: no line says", lines - 1)));
+    assert!(
+        refusal(&with_header(&bytes, |h| h.replace("element vertex 1\n", "element vertex 1\nelement vertex 1\n")))
+            .contains("is missing")
+    );
+    let early = with_header(&bytes, |h| h.replace("element vertex 1\n", "element face 1\nelement vertex 1\n"));
+    assert!(refusal(&early).contains("map.ply:3: `element face 1` comes before"));
+    assert!(refusal(b"ply\nend_header").contains("map.ply:2: the header has no end"));
+}
+
+#[test]
+fn sixteen_bit_properties_are_stepped_over() {
+    let bytes = encode(&cloud(ShDegree::default(), 1)).unwrap();
+    let mut longer = with_header(&bytes, |h| h.replace("end_header", "property ushort label\nend_header"));
+    longer.extend([1, 2]);
+    assert_eq!(read_bytes(&longer).unwrap(), read_bytes(&bytes).unwrap());
+}

@@ -171,6 +171,17 @@ mod tests {
     }
 
     #[test]
+    fn files_give_back_what_they_took() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("poses.txt");
+        let pose = |timestamp_s| StampedPose { timestamp_s, world_from_camera: Isometry3::translation(1.0, 2.0, 3.0) };
+        let trajectory = Trajectory { poses: [0.5, 1.5].map(pose).to_vec() };
+        trajectory.write_tum(&path).unwrap();
+        assert_eq!(Trajectory::read_tum(&path).unwrap().to_tum(), trajectory.to_tum());
+        assert!(Trajectory::read_tum(folder.path()).is_err());
+    }
+
+    #[test]
     fn errors_name_the_file_and_the_line() {
         let message = |text: &str| parse(text).unwrap_err().to_string();
         assert!(message("# head\n0 0 0 0 0 0 0 1\n1 0 0 NaN 0 0 0 1\n").starts_with("poses.txt:3: `NaN`"));

@@ -12,7 +12,7 @@ use crate::splat::ShDegree;
 pub struct MappingConfig {
     /// Degree of the spherical harmonics: 0 has no view dependence.
     pub sh_degree: ShDegree,
-    /// Optimisation steps after each keyframe, one view each.
+    /// Optimisation steps over the window after each keyframe, one view each. Most steps gain more in consolidation.
     pub iterations_per_keyframe: usize,
     /// Steps after the first keyframe, which has no map to start from.
     pub first_iterations: usize,
@@ -53,8 +53,8 @@ impl Default for MappingConfig {
     fn default() -> Self {
         Self {
             sh_degree: ShDegree::new(2).expect("degrees 0 to 3 exist"),
-            iterations_per_keyframe: 30,
-            first_iterations: 100,
+            iterations_per_keyframe: 5,
+            first_iterations: 50,
             yields_to_keyframes: false,
             seed: 0,
             window: WindowConfig::default(),
@@ -266,16 +266,16 @@ impl RefineConfig {
 impl Default for RefineConfig {
     fn default() -> Self {
         Self {
-            growth: 0.0,
-            session_epochs: 0,
-            final_epochs: 0,
+            growth: 1.0,
+            session_epochs: 3,
+            final_epochs: 20,
             steps: 0,
             seconds: None,
-            all_tiles: false,
+            all_tiles: true,
             density_every: 200,
             density_views: 10,
             growth_share: 0.65,
-            half_size_share: 0.3,
+            half_size_share: 0.0,
             final_lr_scale_position: 0.02,
             final_lr_scale: 0.2,
         }
@@ -285,10 +285,19 @@ impl Default for RefineConfig {
 impl MappingConfig {
     /// For recordings whose poses are known: keyframes only arrive, and the refinement makes the map.
     pub fn offline() -> Self {
-        let refine = RefineConfig { steps: 6000, ..RefineConfig::default() };
-        // Points and inserted Gaussians lie further from where they belong than those of a depth image do. The refinement lets all rates fall by itself,
-        // which leaves averages nothing but to lag behind.
-        let adam = AdamConfig { lr_position: 0.16, color_settling_steps: 0.0, ema_steps: 1.0, ..AdamConfig::default() };
+        let refine = RefineConfig {
+            growth: 0.0,
+            session_epochs: 0,
+            final_epochs: 0,
+            steps: 6000,
+            all_tiles: false,
+            half_size_share: 0.3,
+            ..RefineConfig::default()
+        };
+        // Thousands of steps need lower rates, except for positions: points and inserted Gaussians lie further from where they belong than those
+        // of a depth image do. The rates fall by themselves, which leaves averages nothing but to lag behind.
+        let rates = AdamConfig { lr_position: 0.24, lr_harmonics: 0.015, ..AdamConfig::default() }.scaled(2.0 / 3.0, 2.0 / 3.0);
+        let adam = AdamConfig { color_settling_steps: 0.0, ema_steps: 1.0, ..rates };
         // No keyframe inserts anything during the refinement: what the first Gaussians miss must grow out of them.
         let mut density = DensityConfig::default();
         density.multi_view.max_growth = 0.15;

@@ -119,4 +119,25 @@ mod tests {
         assert!(motion(&old, &(old * Se3::new(Vector3::new(0.0, 0.009, 0.0), Vector3::new(0.008, 0.0, 0.0)))).is_none());
         assert!(motion(&old, &(old * Se3::new(Vector3::zeros(), Vector3::new(0.01, 0.0, 0.0)))).is_some());
     }
+
+    #[test]
+    fn a_history_keeps_age_views_and_the_best_of_them() {
+        let mut stats = GaussianStats::default();
+        stats.append(3, 2);
+        let score =
+            |views: f32, weight_max: f32, weight_sum: f32| GaussianScore { views, weight_max, weight_sum, ..Default::default() };
+        stats.keyframe_mapped();
+        stats.scored(&[score(4.0, 0.5, 6.0), score(0.0, 0.0, 0.0)]);
+        stats.keyframe_mapped();
+        stats.scored(&[score(2.0, 0.25, 5.0), score(1.0, 0.125, 0.5)]);
+        let history = |views, best_weight, contribution| GaussianHistory { anchor: 3, age: 2, views, best_weight, contribution };
+        assert_eq!(stats.histories(), [history(6, 0.5, 2.5), history(1, 0.125, 0.5)]);
+    }
+
+    #[test]
+    fn a_shift_counts_only_beyond_its_threshold() {
+        let shifted = |metres: f64| motion(&Se3::identity(), &Se3::translation(metres, 0.0, 0.0));
+        assert_eq!(shifted(MIN_SHIFT_METRES), None);
+        assert_eq!(shifted(2.0 * MIN_SHIFT_METRES), Some(Se3::translation(2.0 * MIN_SHIFT_METRES, 0.0, 0.0)));
+    }
 }

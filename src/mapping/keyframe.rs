@@ -5,14 +5,15 @@ use std::borrow::Cow;
 use image::{GrayImage, Rgb, RgbImage};
 use serde::{Deserialize, Serialize};
 
-use super::KeyframeId;
 use super::exposure;
 use super::gaussian_stats;
+use super::image_store::{ImageStore, StoredImage};
 use super::plane_sweep::{self, SourceView};
 use super::refine_poses::{PoseRefinement, RefinePosesConfig};
+use super::{KeyframeId, MappingError};
 use crate::geometry::{Pinhole, Se3};
 use crate::gpu::{Gpu, GpuError, plain};
-use crate::optimise::{TargetImage, TrainingView};
+use crate::optimise::{Pixels, TargetImage, TrainingView};
 use crate::sequence::{DepthImage, RectifiedImage};
 use crate::splat::{Exposure, ViewCamera};
 
@@ -60,7 +61,7 @@ pub struct RightImage {
     pub baseline_metres: f64,
 }
 
-/// A keyframe in the mapper; its image is kept only while the optimiser needs it.
+/// A keyframe in the mapper.
 #[derive(Debug)]
 pub(super) struct MappedKeyframe {
     /// Identity, ascending in the order of tracking.
@@ -76,8 +77,7 @@ pub(super) struct MappedKeyframe {
     pub exposure: Exposure,
     /// Median of the measured depths, metres; 1 if there are none.
     pub depth_metres: f64,
-    /// Until it is given back.
-    image: Option<Images>,
+    image: Images,
     /// On the host, where depth is swept for.
     gray: Option<GrayImage>,
     pub covisible: Vec<KeyframeId>,
@@ -85,12 +85,14 @@ pub(super) struct MappedKeyframe {
     pub loss: f32,
 }
 
-/// A keyframe's image on the GPU.
+/// A keyframe's image, on the GPU or offloaded.
 #[derive(Debug)]
 struct Images {
     whole: TargetImage,
     /// Target at half the size, where coarse steps use it.
     half: Option<TargetImage>,
+    /// Pixels of both once they are offloaded.
+    stored: Option<(StoredImage, Option<StoredImage>)>,
 }
 
 /// All of a keyframe but its image, which the recording has.
@@ -106,8 +108,8 @@ pub(super) struct KeyframeState {
     depth_metres: f64,
     covisible: Vec<KeyframeId>,
     loss: f32,
-    /// Nothing where the image was given back.
-    tile_losses: Option<TileLosses>,
+    tile_losses: TileLosses,
+    is_resident: bool,
     /// Depth that was swept for, `[H, W]`: it depends on what the other poses were then. Nothing where the recording has it.
     swept: Option<Swept>,
 }
@@ -135,7 +137,7 @@ impl Images {
             TargetImage::new(gpu, &image.color, depth)
         };
         let worth = with_half && image.pinhole.width.min(image.pinhole.height) >= MIN_HALVED;
-        Ok(Self { whole: target(image)?, half: worth.then(|| target(&halved(image))).transpose()? })
+        Ok(Self { whole: target(image)?, half: worth.then(|| target(&halved(image))).transpose()?, stored: None })
     }
 
     fn tile_losses(&self, gpu: &Gpu) -> Result<TileLosses, GpuError> {
@@ -162,14 +164,18 @@ impl MappedKeyframe {
             refinement: PoseRefinement::default(),
             exposure,
             depth_metres: image.median_depth_metres().unwrap_or(1.0),
-            image: Some(Images::new(gpu, image, with_half)?),
+            image: Images::new(gpu, image, with_half)?,
             gray: matches!(keyframe.depth_source, DepthSource::Landmarks { .. }).then(|| plane_sweep::gray(&image.color)),
             covisible: keyframe.covisible.clone(),
             loss: 1.0,
         })
     }
 
-    pub fn state(&self, gpu: &Gpu) -> Result<KeyframeState, GpuError> {
+    pub fn state(&self, gpu: &Gpu, store: &ImageStore) -> Result<KeyframeState, MappingError> {
+        let swept = || match &self.image.stored {
+            Some((whole, _)) => Ok::<_, MappingError>(Swept { metres: store.get(whole)?.depth_metres.clone() }),
+            None => Ok(Swept { metres: self.image.whole.read_pixels(gpu)?.map_or(Vec::new(), |pixels| pixels.depth_metres) }),
+        };
         Ok(KeyframeState {
             id: self.id,
             camera: self.camera,
@@ -180,19 +186,20 @@ impl MappedKeyframe {
             depth_metres: self.depth_metres,
             covisible: self.covisible.clone(),
             loss: self.loss,
-            tile_losses: self.image.as_ref().map(|image| image.tile_losses(gpu)).transpose()?,
-            swept: self
-                .image
-                .as_ref()
-                .filter(|_| self.gray.is_some())
-                .map(|image| image.whole.depth_metres(gpu))
-                .transpose()?
-                .map(|metres| Swept { metres }),
+            tile_losses: self.image.tile_losses(gpu)?,
+            is_resident: self.is_resident(),
+            swept: self.gray.is_some().then(swept).transpose()?,
         })
     }
 
     /// The keyframe of a state, with the image that it had; `None` if the state is of an image of another size.
-    pub fn restore(gpu: &Gpu, state: &KeyframeState, keyframe: &Keyframe, with_half: bool) -> Result<Option<Self>, GpuError> {
+    pub fn restore(
+        gpu: &Gpu,
+        store: &mut ImageStore,
+        state: &KeyframeState,
+        keyframe: &Keyframe,
+        with_half: bool,
+    ) -> Result<Option<Self>, MappingError> {
         let mut image = Cow::Borrowed(&keyframe.image);
         if let Some(Swept { metres }) = &state.swept {
             let Pinhole { width, height, .. } = image.pinhole;
@@ -205,11 +212,11 @@ impl MappedKeyframe {
             image.to_mut().color = exposure::corrected(&image.color, &state.exposure);
         }
         let image = &*image;
-        let images = state.tile_losses.as_ref().map(|_| Images::new(gpu, image, with_half)).transpose()?;
-        if !images.iter().zip(&state.tile_losses).all(|(images, losses)| images.set_tile_losses(gpu, losses)) {
+        let images = Images::new(gpu, image, with_half)?;
+        if !images.set_tile_losses(gpu, &state.tile_losses) {
             return Ok(None);
         }
-        Ok(Some(Self {
+        let mut restored = Self {
             id: state.id,
             camera: state.camera,
             tracked_from_world: state.tracked_from_world,
@@ -221,7 +228,11 @@ impl MappedKeyframe {
             image: images,
             covisible: state.covisible.clone(),
             loss: state.loss,
-        }))
+        };
+        if !state.is_resident {
+            restored.offload(gpu, store)?;
+        }
+        Ok(Some(restored))
     }
 
     /// The tracker moved it. Returns the motion of its Gaussians, new_from_old, once what has added up is more than a refinement.
@@ -245,15 +256,32 @@ impl MappedKeyframe {
         self.track(self.tracked_from_world);
     }
 
-    /// Whether steps can still learn from it.
-    pub fn has_image(&self) -> bool {
-        self.image.is_some()
+    /// Whether its image is on the GPU.
+    pub fn is_resident(&self) -> bool {
+        self.image.whole.is_resident()
     }
 
-    /// Gives the image back; the pose stays, for Gaussians move with it.
-    pub fn forget_image(&mut self) {
-        self.image = None;
-        self.gray = None;
+    /// Moves its image from the GPU to the store.
+    ///
+    /// # Errors
+    /// If the device fails.
+    pub fn offload(&mut self, gpu: &Gpu, store: &mut ImageStore) -> Result<(), GpuError> {
+        let Images { whole, half, stored } = &mut self.image;
+        let Some(pixels) = whole.read_pixels(gpu)? else { return Ok(()) };
+        let halved = half.as_ref().map_or(Ok(None), |half| half.read_pixels(gpu))?;
+        *stored = Some((store.put(pixels), halved.map(|pixels| store.put(pixels))));
+        whole.offload();
+        half.iter_mut().for_each(TargetImage::offload);
+        Ok(())
+    }
+
+    /// Pixels of the offloaded image, of the smaller one if `coarse` and there is one; `None` if they are on the GPU.
+    ///
+    /// # Errors
+    /// If the store cannot be read.
+    pub fn streamed<'a>(&'a self, coarse: bool, store: &ImageStore) -> std::io::Result<Option<Cow<'a, Pixels>>> {
+        let image = self.image.stored.as_ref().map(|(whole, half)| half.as_ref().filter(|_| coarse).unwrap_or(whole));
+        image.map(|image| store.get(image)).transpose()
     }
 
     /// Whether its depth, if any, was estimated and not measured.
@@ -269,19 +297,22 @@ impl MappedKeyframe {
     /// Bytes of its image on the GPU.
     pub fn image_bytes(&self) -> u64 {
         let pixels = u64::from(self.camera.pinhole.width * self.camera.pinhole.height);
-        self.image.as_ref().map_or(0, |image| if image.half.is_some() { pixels * 10 } else { pixels * 8 })
+        match (self.is_resident(), &self.image.half) {
+            (false, _) => 0,
+            (true, None) => pixels * 8,
+            (true, Some(_)) => pixels * 10,
+        }
     }
 
-    /// Training view; the smaller image if `coarse` and there is one. `None` without an image.
-    pub fn view(&self, coarse: bool) -> Option<TrainingView<'_>> {
-        let image = self.image.as_ref()?;
-        Some(match image.half.as_ref().filter(|_| coarse) {
-            None => TrainingView::new(self.camera, &image.whole),
+    /// Training view; the smaller image if `coarse` and there is one. An offloaded image is still to be streamed.
+    pub fn view(&self, coarse: bool) -> TrainingView<'_> {
+        match self.image.half.as_ref().filter(|_| coarse) {
+            None => TrainingView::new(self.camera, &self.image.whole),
             Some(target) => {
                 let pinhole = halved_pinhole(&self.camera.pinhole);
                 TrainingView::new(ViewCamera { pinhole, ..self.camera }, target)
             }
-        })
+        }
     }
 }
 

@@ -1,5 +1,5 @@
 //! Holding the map within bounds on a recording of any length: how many Gaussians there may be, which go when others need their place, and
-//! which keyframes give their images back.
+//! which keyframes' images leave the GPU.
 
 use serde::{Deserialize, Serialize};
 
@@ -28,13 +28,15 @@ pub struct LimitsConfig {
     /// Most bytes of GPU memory, as well as it can be foreseen.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub max_gpu_bytes: Option<u64>,
-    /// Keyframes whose images are kept to learn from.
-    pub max_keyframes: usize,
+    /// Keyframes whose images stay on the GPU; a step uploads any other.
+    pub max_gpu_images: usize,
+    /// Most bytes of host memory for these others; the rest is in a temporary file.
+    pub max_host_bytes: u64,
 }
 
 impl Default for LimitsConfig {
     fn default() -> Self {
-        Self { max_gaussians: None, max_gpu_bytes: None, max_keyframes: 400 }
+        Self { max_gaussians: None, max_gpu_bytes: None, max_gpu_images: 400, max_host_bytes: 4 << 30 }
     }
 }
 
@@ -56,11 +58,11 @@ impl LimitsConfig {
         bytes.saturating_sub(map_bytes + capacity as u64 * SCRATCH_BYTES_EACH)
     }
 
-    /// The most keyframes with images of `image_bytes` each.
-    pub(super) fn keyframes(&self, image_bytes: u64) -> usize {
+    /// The most images of `image_bytes` each on the GPU.
+    pub(super) fn gpu_images(&self, image_bytes: u64) -> usize {
         let by_memory =
             self.max_gpu_bytes.map_or(usize::MAX, |limit| (IMAGES_SHARE * limit as f64) as usize / image_bytes.max(1) as usize);
-        self.max_keyframes.min(by_memory).max(LEAST_KEYFRAMES)
+        self.max_gpu_images.min(by_memory).max(LEAST_KEYFRAMES)
     }
 
     /// Checks every value.
@@ -71,8 +73,8 @@ impl LimitsConfig {
         if self.max_gaussians.is_some_and(|n| n < LEAST_GAUSSIANS) {
             return Err(format!("max_gaussians must be at least {LEAST_GAUSSIANS}"));
         }
-        if self.max_keyframes < LEAST_KEYFRAMES {
-            return Err(format!("max_keyframes must be at least {LEAST_KEYFRAMES}"));
+        if self.max_gpu_images < LEAST_KEYFRAMES {
+            return Err(format!("max_gpu_images must be at least {LEAST_KEYFRAMES}"));
         }
         Ok(())
     }
@@ -92,10 +94,10 @@ pub(super) fn largest_contributions(histories: &[GaussianHistory], most: usize) 
     ranked
 }
 
-/// The keyframe whose image is missed least: of those that still have one and are not among the `recent` newest, the one between the two
+/// The keyframe whose image leaves the GPU first: of those that have one there and are not among the `recent` newest, the one between the two
 /// nearest neighbours in time. The first stays, it holds the world.
 pub(super) fn least_needed_keyframe(keyframes: &[MappedKeyframe], recent: usize) -> Option<usize> {
-    let with_image: Vec<usize> = (0..keyframes.len().saturating_sub(recent)).filter(|&k| keyframes[k].has_image()).collect();
+    let with_image: Vec<usize> = (0..keyframes.len().saturating_sub(recent)).filter(|&k| keyframes[k].is_resident()).collect();
     // Radians and metres weigh alike: at a metre's distance they move the image alike.
     let apart = |a: usize, b: usize| {
         let b_from_a = keyframes[b].camera.camera_from_world * keyframes[a].camera.camera_from_world.inverse();
@@ -121,7 +123,7 @@ mod tests {
     #[test]
     fn memory_is_shared_by_images_and_gaussians() {
         let limits = LimitsConfig { max_gpu_bytes: Some(100_000_000), ..LimitsConfig::default() };
-        assert_eq!(limits.keyframes(1_000_000), 40);
+        assert_eq!(limits.gpu_images(1_000_000), 40);
         let most = limits.gaussians(672, 40_000_000);
         assert!((74_000..76_000).contains(&most), "{most}");
         assert_eq!(LimitsConfig { max_gaussians: Some(5000), ..limits }.gaussians(672, 0), 5000);

@@ -18,13 +18,16 @@ pub use refine::{FinalRefinement, RefineReport};
 pub use state::MapperState;
 
 use super::gaussian_stats::GaussianStats;
+use super::image_store::ImageStore;
 use super::keyframe::{DepthSource, MappedKeyframe};
 use super::plane_sweep::{self, SourceView};
 use super::refine_poses::RefinedPair;
 use super::schedule::{self, Session, Step};
-use super::{Keyframe, KeyframeId, LimitsConfig, MappingConfig, exposure, initialise_from_points, insertion, limits};
+use super::{
+    Keyframe, KeyframeId, LimitsConfig, MappingConfig, MappingError, exposure, initialise_from_points, insertion, limits,
+};
 use crate::geometry::Se3;
-use crate::gpu::{Gpu, GpuError};
+use crate::gpu::Gpu;
 use crate::optimise::{AdamConfig, ErrorPixels, StepReport, TileSampling, Trainer, TrainingView};
 use crate::render::{GpuCloud, Plan, Rendered};
 use crate::sequence::{KnownPoint, RectifiedImage};
@@ -36,32 +39,6 @@ const FIRST_CAPACITY: usize = 4096;
 const BATCH: usize = 10;
 /// Fewer where others wait for the machine.
 const YIELDING_BATCH: usize = 3;
-
-/// Failure of the mapper.
-#[derive(Debug, thiserror::Error)]
-pub enum MappingError {
-    /// Failure of the adapter.
-    #[error(transparent)]
-    Gpu(#[from] GpuError),
-    /// No keyframe has depth to start from.
-    #[error("none of the keyframes has depth, neither measured nor of landmarks, and a map can only begin with depth")]
-    NoDepth,
-    /// The loss of a keyframe is not finite.
-    #[error("the loss of keyframe {id} is not finite; please report this with the recording's name and the configuration")]
-    NotFinite {
-        /// The keyframe.
-        id: KeyframeId,
-    },
-    /// A replayed keyframe differs from the checkpoint's.
-    #[error("keyframe {id} comes in another place or another size than before")]
-    NotTheSame {
-        /// The keyframe.
-        id: KeyframeId,
-    },
-    /// The checkpoint's parts contradict each other.
-    #[error("the mapper's state contradicts itself")]
-    State,
-}
 
 /// Result of mapping a keyframe.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -95,9 +72,11 @@ pub struct Mapper {
     cloud: GpuCloud,
     stats: GaussianStats,
     keyframes: Vec<MappedKeyframe>,
+    /// Images beyond those on the GPU.
+    images: ImageStore,
     rng: Rng,
     step_times: Vec<Duration>,
-    /// Keyframes with images at the last online session of consolidation.
+    /// Keyframes at the last online session of consolidation.
     consolidated: usize,
 }
 
@@ -113,6 +92,7 @@ impl Mapper {
             cloud: GpuCloud::new(&gpu, config.sh_degree, FIRST_CAPACITY)?,
             stats: GaussianStats::default(),
             keyframes: Vec::new(),
+            images: ImageStore::new(config.limits.max_host_bytes),
             rng: Rng::with_seed(config.seed),
             step_times: Vec::new(),
             consolidated: 0,
@@ -138,7 +118,7 @@ impl Mapper {
         // Before its insertion: a bound on memory leaves to it what the image has left.
         let mapped = MappedKeyframe::new(&self.gpu, &keyframe, exposure, self.config.learns_at_half_size())?;
         self.keyframes.push(mapped);
-        self.limit_keyframes();
+        self.limit_gpu_images()?;
         let inserted = self.insert_gaussians(&keyframe, rendered.as_ref())?;
         let first = self.keyframes.len() == 1;
         let iterations = if first { self.config.first_iterations } else { self.config.iterations_per_keyframe };
@@ -292,16 +272,17 @@ impl Mapper {
         self.config.limits.gaussians(self.cloud.bytes_each(), other)
     }
 
-    /// Keyframes beyond their number give their images back.
-    fn limit_keyframes(&mut self) {
-        let most = self.keyframes.last().map_or(usize::MAX, |k| self.config.limits.keyframes(k.image_bytes()));
-        let mut kept = self.keyframes.iter().filter(|k| k.has_image()).count();
-        while kept > most
+    /// Images beyond their number leave the GPU.
+    fn limit_gpu_images(&mut self) -> Result<(), MappingError> {
+        let most = self.keyframes.last().map_or(usize::MAX, |k| self.config.limits.gpu_images(k.image_bytes()));
+        let mut resident = self.keyframes.iter().filter(|k| k.is_resident()).count();
+        while resident > most
             && let Some(k) = limits::least_needed_keyframe(&self.keyframes, self.config.window.recent)
         {
-            self.keyframes[k].forget_image();
-            kept -= 1;
+            self.keyframes[k].offload(&self.gpu, &mut self.images)?;
+            resident -= 1;
         }
+        Ok(())
     }
 
     /// Steps over the window until all are taken or nothing more is gained; on the way some of them score the Gaussians, whose density is
@@ -372,13 +353,15 @@ impl Mapper {
         tile_sampling: Option<TileSampling>,
         adam: &AdamConfig,
     ) -> Result<Vec<StepReport>, MappingError> {
-        let view = |step: &Step| {
+        let streamed = batch.iter().map(|step| self.keyframes[step.keyframe].streamed(step.coarse, &self.images));
+        let streamed = streamed.collect::<Result<Vec<_>, _>>()?;
+        let views = batch.iter().zip(&streamed).map(|(step, pixels)| {
             let keyframe = &self.keyframes[step.keyframe];
-            let view = keyframe.view(step.coarse).expect("only keyframes with images are drawn");
+            let view = keyframe.view(step.coarse);
             let depth_confidence = if keyframe.depth_is_estimated() { self.config.plane_sweep.depth_confidence } else { 1.0 };
-            TrainingView { lr_scale: step.lr_scale, depth_confidence, scored, tile_sampling, ..view }
-        };
-        let views: Vec<TrainingView<'_>> = batch.iter().map(view).collect();
+            TrainingView { streamed: pixels.as_deref(), lr_scale: step.lr_scale, depth_confidence, scored, tile_sampling, ..view }
+        });
+        let views: Vec<TrainingView<'_>> = views.collect();
         let started = Instant::now();
         let reports = self.trainer.steps(&self.cloud, &views, &self.config.loss, adam)?;
         self.step_times.extend(std::iter::repeat_n(started.elapsed() / batch.len().max(1) as u32, batch.len()));

@@ -3,8 +3,10 @@
 
 mod config;
 mod density;
+mod error;
 mod exposure;
 mod gaussian_stats;
+mod image_store;
 mod initialise_from_points;
 mod insertion;
 mod keyframe;
@@ -18,10 +20,11 @@ mod schedule;
 
 pub use config::{InsertionConfig, MappingConfig, PointsConfig, RefineConfig, ScheduleConfig, TileSamplingConfig, WindowConfig};
 pub use density::{ClassicConfig, DensityConfig, DensityStrategy, MultiViewConfig};
+pub use error::MappingError;
 pub use exposure::ExposureConfig;
 pub use keyframe::{DepthSource, Keyframe, RightImage};
 pub use limits::LimitsConfig;
-pub use mapper::{FinalRefinement, KeyframeReport, Mapper, MapperState, MappingError, RefineReport};
+pub use mapper::{FinalRefinement, KeyframeReport, Mapper, MapperState, RefineReport};
 pub use message::MapperMessage;
 pub use plane_sweep::PlaneSweepConfig;
 pub use refine_poses::{RefinePosesConfig, RefinedPair};

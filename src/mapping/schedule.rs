@@ -19,7 +19,7 @@ pub(super) fn window(keyframes: &[MappedKeyframe], config: &WindowConfig) -> Vec
     let mut window: Vec<usize> = (recent..len).rev().collect();
     let covisible = &keyframes[len - 1].covisible;
     let older = covisible.iter().filter_map(|id| keyframes[..recent].binary_search_by_key(id, |k| k.id).ok());
-    window.extend(older.filter(|&k| keyframes[k].has_image()).take(config.covisible));
+    window.extend(older.take(config.covisible));
     window
 }
 
@@ -119,7 +119,7 @@ impl Session {
 
 /// Any keyframe before the newest ones; those with more loss more often, if so wished.
 fn draw_older(keyframes: &[MappedKeyframe], recent: usize, rng: &mut Rng, by_loss: bool) -> usize {
-    let older = keyframes[..keyframes.len() - recent.min(keyframes.len() - 1)].iter().enumerate().filter(|(_, k)| k.has_image());
+    let older = keyframes[..keyframes.len() - recent.min(keyframes.len() - 1)].iter().enumerate();
     let weight = |k: &MappedKeyframe| if by_loss { k.loss } else { 1.0 };
     let total: f32 = older.clone().map(|(_, k)| weight(k)).sum();
     let mut left = rng.f32() * total;

@@ -4,9 +4,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::render::layout::AdamSetup;
 
-/// Step sizes and decay rates (Kingma & Ba 2015). The ratios between parameters began as those of 3DGS (Kerbl et al. 2023) at four times its
-/// rates: a live map gets tens of steps a keyframe, not tens of thousands. Sizes and turns take three times that still, and the first
-/// moment forgets sooner, since each step sees another view. `benches/README.md` has what these are worth.
+/// Step sizes and decay rates (Kingma & Ba 2015), several times those of 3DGS (Kerbl et al. 2023): a map gets tens of steps a keyframe, not
+/// tens of thousands. The first moment forgets sooner, since each step sees another view. `docs/lab-notes` has what these are worth.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct AdamConfig {
@@ -45,12 +44,12 @@ pub struct AdamConfig {
 impl Default for AdamConfig {
     fn default() -> Self {
         Self {
-            lr_position: 0.08,
-            lr_opacity: 1e-1,
-            lr_log_scale: 6e-2,
-            lr_rotation: 1.2e-2,
-            lr_color: 2e-2,
-            lr_harmonics: 1e-2,
+            lr_position: 0.12,
+            lr_opacity: 0.15,
+            lr_log_scale: 0.09,
+            lr_rotation: 0.018,
+            lr_color: 0.03,
+            lr_harmonics: 0.03,
             harmonics_every: 1,
             beta_1: 0.8,
             beta_2: 0.999,

@@ -1,16 +1,16 @@
 //! Buffers of the image loss, for each size of view in turn.
 
-use super::TargetImage;
+use super::loss::GpuPixels;
 use crate::gpu::{Gpu, GpuBuffer, GpuError};
 use crate::render::layout::{TILE_HEIGHT, TILE_WIDTH};
 
 /// Pixels along a side of what one workgroup of the loss shaders covers.
 pub(super) const LOSS_TILE: u32 = 16;
-const LOSS_RADIUS: u32 = 5;
+const WINDOW_BORDER: u32 = 3;
 
-/// Twin of the shaders' function: pixels along a side of a plane with a border of zeros.
-fn bordered(size: u32) -> u32 {
-    size.next_multiple_of(LOSS_TILE) + 2 * LOSS_RADIUS
+/// Twin of the shaders' function: SSIM's windows along a side, with a border.
+fn bordered_windows(size: u32) -> u64 {
+    u64::from(size.next_multiple_of(LOSS_TILE) / 2 + 2 * WINDOW_BORDER)
 }
 
 /// Tiles of an image, for which the loss is summed.
@@ -26,7 +26,7 @@ const SIZES_KEPT: usize = 2;
 pub(super) struct ImageBuffers {
     pub size: (u32, u32),
     /// The step's target, copied to one place: bind groups over each view's own buffers would be made anew all the time.
-    pub target: TargetImage,
+    pub target: GpuPixels,
     pub partials: GpuBuffer,
     pub gradients: GpuBuffer,
     /// [tiles] of the step's view, those of tiles left out from earlier steps; its length is the number of terms that are summed.
@@ -37,8 +37,8 @@ impl ImageBuffers {
     fn new(gpu: &Gpu, (width, height): (u32, u32)) -> Result<Self, GpuError> {
         Ok(Self {
             size: (width, height),
-            target: TargetImage::blank(gpu, (width, height))?,
-            partials: GpuBuffer::storage(gpu, "loss partials", u64::from(bordered(width)) * u64::from(bordered(height)) * 48)?,
+            target: GpuPixels::blank(gpu, (width, height))?,
+            partials: GpuBuffer::storage(gpu, "loss partials", bordered_windows(width) * bordered_windows(height) * 48)?,
             gradients: GpuBuffer::storage(gpu, "image gradients", u64::from(width * height) * 32)?,
             loss_sums: GpuBuffer::storage(gpu, "loss sums", tiles((width, height)) as u64 * 16)?,
         })

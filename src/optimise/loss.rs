@@ -24,6 +24,14 @@ impl Default for LossConfig {
     }
 }
 
+/// First pixel along x and y with a window of SSIM, 0 or 1, when `steps` have been taken: one step evaluates every second window of every
+/// second row.
+pub fn ssim_phase(steps: usize) -> [u32; 2] {
+    // Top bits of a multiplicative hash (Knuth, TAOCP 6.4): no period that a shuffled epoch could share.
+    let bits = (steps as u32).wrapping_mul(0x9E37_79B9) >> 30;
+    [bits & 1, bits >> 1]
+}
+
 impl LossConfig {
     /// Says what is wrong with the values, if anything.
     ///
@@ -75,15 +83,53 @@ impl LossTerms {
     }
 }
 
-/// A keyframe's image on the GPU: 8-bit colour and sensor depth.
+/// A view's pixels on the host, as the GPU has them.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Pixels {
+    /// `[H * W]` 8-bit RGBA.
+    pub color: Vec<u32>,
+    /// `[H * W]` metres, 0 where not measured.
+    pub depth_metres: Vec<f32>,
+}
+
+/// A view's pixels on the GPU.
+#[derive(Debug)]
+pub(super) struct GpuPixels {
+    pub color: GpuBuffer,
+    pub depth: GpuBuffer,
+}
+
+impl GpuPixels {
+    /// A black image without depth.
+    pub fn blank(gpu: &Gpu, (width, height): (u32, u32)) -> Result<Self, GpuError> {
+        let bytes = u64::from(width) * u64::from(height) * 4;
+        let plane = |label: &str| GpuBuffer::storage(gpu, label, bytes);
+        Ok(Self { color: plane("target colour")?, depth: plane("target depth")? })
+    }
+
+    /// Becomes a copy of an image of the same size.
+    pub fn encode_copy(&self, encoder: &mut wgpu::CommandEncoder, of: &Self) {
+        for (from, to) in [(&of.color, &self.color), (&of.depth, &self.depth)] {
+            encoder.copy_buffer_to_buffer(from.raw(), 0, to.raw(), 0, from.raw().size());
+        }
+    }
+
+    /// Becomes an image of the same size, before the next submission.
+    pub fn write(&self, gpu: &Gpu, pixels: &Pixels) {
+        self.color.write(gpu, 0, &pixels.color);
+        self.depth.write(gpu, 0, &pixels.depth_metres);
+    }
+}
+
+/// What a view should look like: 8-bit colour and sensor depth, on the GPU unless offloaded.
 #[derive(Debug)]
 pub struct TargetImage {
     /// Pixels along x.
     pub width: u32,
     /// Pixels along y.
     pub height: u32,
-    pub(super) color: GpuBuffer,
-    pub(super) depth: GpuBuffer,
+    /// Nothing once offloaded.
+    pub(super) pixels: Option<GpuPixels>,
     /// [tiles] sums of the loss terms when each tile was last worked on, see `loss_forward.wgsl`.
     pub(super) tile_losses: GpuBuffer,
 }
@@ -94,32 +140,40 @@ impl TargetImage {
     /// # Errors
     /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn new(gpu: &Gpu, image: &RgbImage, depth_metres: Option<&[f32]>) -> Result<Self, GpuError> {
-        let target = Self::blank(gpu, image.dimensions())?;
+        let (width, height) = image.dimensions();
+        let pixels = GpuPixels::blank(gpu, (width, height))?;
         let packed: Vec<u32> = image.pixels().map(|p| u32::from_le_bytes([p.0[0], p.0[1], p.0[2], 255])).collect();
-        target.color.write(gpu, 0, &packed);
+        pixels.color.write(gpu, 0, &packed);
         if let Some(metres) = depth_metres {
             assert_eq!(metres.len(), packed.len(), "depth has the size of the image");
-            target.depth.write(gpu, 0, metres);
+            pixels.depth.write(gpu, 0, metres);
         }
-        Ok(target)
-    }
-
-    /// A black image without depth.
-    pub(super) fn blank(gpu: &Gpu, (width, height): (u32, u32)) -> Result<Self, GpuError> {
-        let bytes = u64::from(width) * u64::from(height) * 4;
-        let plane = |label: &str| GpuBuffer::storage(gpu, label, bytes);
         let unknown = vec![[-1.0f32, 0.0, 0.0, 0.0]; image_buffers::tiles((width, height))];
         let tile_losses = GpuBuffer::storage(gpu, "tile losses", unknown.len() as u64 * 16)?;
         tile_losses.write(gpu, 0, &unknown);
-        Ok(Self { width, height, color: plane("target colour")?, depth: plane("target depth")?, tile_losses })
+        Ok(Self { width, height, pixels: Some(pixels), tile_losses })
     }
 
-    /// Its depth, `[H, W]`, read back.
+    /// Whether its pixels are on the GPU.
+    pub fn is_resident(&self) -> bool {
+        self.pixels.is_some()
+    }
+
+    /// Its pixels, read back; `None` if they are offloaded.
     ///
     /// # Errors
     /// [`GpuError`] if a buffer does not fit or the device fails.
-    pub fn depth_metres(&self, gpu: &Gpu) -> Result<Vec<f32>, GpuError> {
-        self.depth.read(gpu, 0, (self.width * self.height) as usize)
+    pub fn read_pixels(&self, gpu: &Gpu) -> Result<Option<Pixels>, GpuError> {
+        let count = (self.width * self.height) as usize;
+        let read = |on_gpu: &GpuPixels| {
+            Ok(Pixels { color: on_gpu.color.read(gpu, 0, count)?, depth_metres: on_gpu.depth.read(gpu, 0, count)? })
+        };
+        self.pixels.as_ref().map(read).transpose()
+    }
+
+    /// Frees its pixels on the GPU: from here on a [`TrainingView`](super::TrainingView) brings them along.
+    pub fn offload(&mut self) {
+        self.pixels = None;
     }
 
     /// The losses of its tiles when each was last worked on, read back.
@@ -137,12 +191,5 @@ impl TargetImage {
             self.tile_losses.write(gpu, 0, losses);
         }
         fits
-    }
-
-    /// Becomes a copy of an image of the same size.
-    pub(super) fn encode_copy(&self, encoder: &mut wgpu::CommandEncoder, of: &Self) {
-        for (from, to) in [(&of.color, &self.color), (&of.depth, &self.depth)] {
-            encoder.copy_buffer_to_buffer(from.raw(), 0, to.raw(), 0, from.raw().size());
-        }
     }
 }

@@ -9,7 +9,7 @@ mod tile_sampling;
 mod trainer;
 
 pub use adam::AdamConfig;
-pub use loss::{LossConfig, LossTerms, TargetImage};
+pub use loss::{LossConfig, LossTerms, Pixels, TargetImage, ssim_phase};
 pub use scores::{ErrorPixels, GaussianScore};
 pub use tile_sampling::TileSampling;
 pub use trainer::{Gradients, ImageGradients, StepReport, Trainer, TrainerState, TrainingView};

@@ -62,7 +62,7 @@ impl TileSampler {
     pub fn encode_fill(&self, pass: &mut wgpu::ComputePass<'_>, rasterizer: &Rasterizer, images: &ImageBuffers) {
         let (gpu, ws, target) = (rasterizer.gpu(), &rasterizer.workspace, &images.target);
         let bindings = [(0, rasterizer.view()), (1, &ws.unsampled), (2, &target.color), (3, &ws.color_depth)];
-        let tiles = image_buffers::tiles((target.width, target.height)) as u32;
+        let tiles = image_buffers::tiles(images.size) as u32;
         self.fill.dispatch(gpu, pass, &bindings, workgroups(tiles));
     }
 }

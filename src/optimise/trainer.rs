@@ -14,7 +14,7 @@ use super::image_buffers::{self, ImageBuffers};
 use super::kernels::Kernels;
 use super::scores::{ErrorPixels, GaussianScore, ScoredImage, Scores};
 use super::tile_sampling::{TileSampler, TileSampling};
-use super::{AdamConfig, LossConfig, LossTerms, TargetImage};
+use super::{AdamConfig, LossConfig, LossTerms, Pixels, TargetImage};
 use crate::gpu::{Gpu, GpuBuffer, GpuError};
 use crate::render::layout::{AdamSetup, COUNTERS, Counter, LossSetup, View};
 use crate::render::{BlendForm, GpuCloud, Rasterizer, Rendered, ViewCounts, cloud_from_planes};
@@ -38,6 +38,8 @@ pub struct TrainingView<'a> {
     pub camera: ViewCamera,
     /// Recorded image and depth.
     pub target: &'a TargetImage,
+    /// Pixels of an offloaded target.
+    pub streamed: Option<&'a Pixels>,
     /// Whether the step also scores the Gaussians (see [`Trainer::begin_scores`]).
     pub scored: Option<ErrorPixels>,
     /// Factor on all learning rates of the step.
@@ -51,7 +53,7 @@ pub struct TrainingView<'a> {
 impl<'a> TrainingView<'a> {
     /// The whole view at full learning rates, not scored.
     pub fn new(camera: ViewCamera, target: &'a TargetImage) -> Self {
-        Self { camera, target, scored: None, lr_scale: 1.0, depth_confidence: 1.0, tile_sampling: None }
+        Self { camera, target, streamed: None, scored: None, lr_scale: 1.0, depth_confidence: 1.0, tile_sampling: None }
     }
 }
 
@@ -86,9 +88,10 @@ pub struct ImageGradients {
 
 /// Where the backward pass starts from.
 enum Objective<'a> {
-    /// With the confidence in the target's depth, the scores to compute, and the tile sampling with the seed of its draw.
+    /// With an offloaded target's pixels, the confidence in its depth, the scores to compute, and the tile sampling with its seed.
     Image {
         target: &'a TargetImage,
+        streamed: Option<&'a Pixels>,
         loss: (&'a LossConfig, f32),
         scored: Option<&'a ErrorPixels>,
         tile_sampling: Option<(TileSampling, u32)>,
@@ -182,15 +185,15 @@ impl Trainer {
         let mut pending: Vec<usize> = (0..views.len()).collect();
         while !pending.is_empty() {
             for (entry, &i) in pending.iter().enumerate() {
-                let TrainingView { camera, target, scored, lr_scale, depth_confidence, tile_sampling } = &views[i];
+                let TrainingView { camera, target, streamed, scored, lr_scale, depth_confidence, tile_sampling } = &views[i];
                 let tile_sampling = tile_sampling.filter(|_| scored.is_none()).map(|sampling| (sampling, self.steps as u32));
-                let objective =
-                    Objective::Image { target, loss: (loss, *depth_confidence), scored: scored.as_ref(), tile_sampling };
+                let (streamed, loss) = (*streamed, (loss, *depth_confidence));
+                let objective = Objective::Image { target, streamed, loss, scored: scored.as_ref(), tile_sampling };
                 let started = Instant::now();
                 self.adam.write(&gpu, 0, &[adam.setup(self.steps, *lr_scale)]);
-                self.steps += 1;
                 let mut encoder = gpu.device.create_command_encoder(&Default::default());
                 self.encode(&mut encoder, cloud, &Viewpoint { camera, background: [0.0; 3] }, &objective, &Sink::Adam)?;
+                self.steps += 1;
                 self.encode_log(&mut encoder, &log, entry);
                 gpu.queue.submit([encoder.finish()]);
                 self.encode_time += started.elapsed();
@@ -265,7 +268,7 @@ impl Trainer {
         loss: &LossConfig,
     ) -> Result<Gradients, GpuError> {
         let gpu = self.rasterizer.gpu().clone();
-        let objective = Objective::Image { target, loss: (loss, 1.0), scored: None, tile_sampling: None };
+        let objective = Objective::Image { target, streamed: None, loss: (loss, 1.0), scored: None, tile_sampling: None };
         let mut gradients = self.collect(cloud, camera, [0.0; 3], &objective)?;
         gradients.loss = self.read_loss(&gpu, target)?;
         Ok(gradients)
@@ -340,8 +343,11 @@ impl Trainer {
         let prepared = self.rasterizer.prepare(cloud, viewpoint.camera, viewpoint.background)?;
         self.reserve(&gpu, &prepared.view, cloud)?;
         self.rasterizer.encode_clear(encoder);
-        if let Objective::Image { target, .. } = objective {
-            self.images[0].target.encode_copy(encoder, target);
+        if let Objective::Image { target, streamed, .. } = objective {
+            match (&target.pixels, streamed) {
+                (Some(pixels), _) => self.images[0].target.encode_copy(encoder, pixels),
+                (None, streamed) => self.images[0].target.write(&gpu, streamed.expect("a view brings an offloaded target along")),
+            }
             copy(encoder, &target.tile_losses, &self.images[0].loss_sums);
         }
         if let Sink::Gradient(buffer) = sink {

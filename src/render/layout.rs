@@ -292,6 +292,12 @@ host_twins! {
         precise_depth: f32,
         /// Confidence of the depth image, 0 to 1.
         depth_confidence: f32,
+        /// First pixel with a window of SSIM along x, 0 or 1.
+        phase_x: u32,
+        /// The same along y.
+        phase_y: u32,
+        /// Pixels of the image for each of its windows.
+        pixels_per_window: f32,
     }
     /// High-error mask (`shaders/rasterize_scores.wgsl`).
     ScoreSetup {

@@ -102,10 +102,15 @@ fn online_sessions_follow_the_growth_of_the_keyframes() {
     let mut mapper = Mapper::new(gpu.clone(), &config).unwrap();
     assert_eq!(sessions(&steps(&config, &mut mapper, 0..40)), [(7, 16), (15, 32), (31, 64)]);
 
-    let mut bounded = config.clone();
-    bounded.limits.max_keyframes = 10;
-    let mut mapper = Mapper::new(gpu.clone(), &bounded).unwrap();
-    assert_eq!(sessions(&steps(&bounded, &mut mapper, 0..40)), [(7, 16)]);
+    // Where the images are makes no difference: on the GPU, in memory, in a file.
+    let whole = mapper.download().unwrap();
+    for max_host_bytes in [1 << 30, 300_000, 0] {
+        let mut bounded = config.clone();
+        (bounded.limits.max_gpu_images, bounded.limits.max_host_bytes) = (10, max_host_bytes);
+        let mut mapper = Mapper::new(gpu.clone(), &bounded).unwrap();
+        assert_eq!(sessions(&steps(&bounded, &mut mapper, 0..40)), [(7, 16), (15, 32), (31, 64)]);
+        assert_eq!(mapper.download().unwrap(), whole, "{max_host_bytes} bytes");
+    }
 
     // A resumed mapper knows when the last session was.
     let mut mapper = Mapper::new(gpu.clone(), &config).unwrap();

@@ -128,7 +128,7 @@ fn loss_gradient_is_a_central_difference() {
         depth: (0..width * height).map(|_| 2.0 * number()).collect(),
         transmittance: (0..width * height).map(|_| 0.4 * number()).collect(),
     };
-    let weights = LossWeights { ssim: 0.2, depth: 0.3, precise_depth: 1.5 };
+    let weights = LossWeights { ssim: 0.2, depth: 0.3, precise_depth: 1.5, phase: [1, 0] };
     let (_, gradient) = loss(&image, &target, &weights);
     let value = |change: &dyn Fn(&mut Image64)| {
         let mut moved = image.clone();

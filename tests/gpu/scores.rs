@@ -2,7 +2,7 @@
 
 use fastrand::Rng;
 use image::{Rgb, RgbImage};
-use keysplat::optimise::{AdamConfig, ErrorPixels, LossConfig, TargetImage, Trainer, TrainingView};
+use keysplat::optimise::{AdamConfig, ErrorPixels, LossConfig, TargetImage, Trainer, TrainingView, ssim_phase};
 use keysplat::render::{BlendForm, GpuCloud};
 use keysplat::splat::ShDegree;
 use keysplat::verification::reference::loss::{LossWeights, Target64, loss};
@@ -34,7 +34,7 @@ fn scores_are_those_of_their_definition() {
         let threshold = (f64::from(wrong_config.error_ratio) * mean).max(f64::from(wrong_config.noise));
         let wrong: Vec<bool> = errors.iter().map(|e| *e > threshold).collect();
         let clear_cut = errors.iter().all(|e| (e - threshold).abs() > 1e-4);
-        let weights = LossWeights { ssim: f64::from(loss_config.ssim_weight), depth: 0.0, precise_depth: 1.0 };
+        let weights = LossWeights { ssim: f64::from(loss_config.ssim_weight), depth: 0.0, precise_depth: 1.0, phase: [0, 0] };
         let target = Target64 { width: width as usize, height: height as usize, color, depth: vec![0.0; errors.len()] };
         let (total, by_image) = loss(&rendered, &target, &weights);
         let expected = scores(&view, &cloud_64, &by_image, &wrong);
@@ -45,9 +45,11 @@ fn scores_are_those_of_their_definition() {
         let target = TargetImage::new(&gpu, &image, None).unwrap();
         let view = TrainingView { scored: Some(wrong_config), ..TrainingView::new(camera, &target) };
         trainer.begin_scores(&on_gpu).unwrap();
-        // Nothing moves, so that both views score the same map.
+        // Nothing moves, and the step in between, which is not scored, gives the other two the same windows of SSIM: both score the same.
         let still = AdamConfig::default().scaled(0.0, 0.0);
-        trainer.steps(&on_gpu, &[view; 2], &loss_config, &still).unwrap();
+        let views = [view, TrainingView { scored: None, ..view }, view];
+        assert_eq!([ssim_phase(0), ssim_phase(2)], [[0, 0]; 2]);
+        trainer.steps(&on_gpu, &views, &loss_config, &still).unwrap();
         let found = trainer.read_scores(&on_gpu).unwrap();
 
         let compare = |name: &str, found: Vec<f32>, expected: Vec<f64>| {

@@ -151,7 +151,8 @@ fn what_the_tracker_was_told_and_what_memory_allows_comes_again() {
     if skipped_without_adapter() {
         return;
     }
-    let settings = ["tracking.keyframe_translation=0.005", "mapping.refine_poses.enabled=true", "mapping.limits.max_keyframes=8"];
+    let settings =
+        ["tracking.keyframe_translation=0.005", "mapping.refine_poses.enabled=true", "mapping.limits.max_gpu_images=8"];
     let more: Vec<&str> = settings.iter().flat_map(|s| ["--set", s]).chain(["--max-gpu-memory", "18M"]).collect();
     survives("told", recording(), &more, 11);
     let whole = metrics(&scratch().join("told-whole"));

@@ -21,23 +21,23 @@ fn a_sweep_is_made_once_and_compared() {
         return;
     }
     let out = scratch().join("sweep");
-    let points = ["--iterations", "2,6", "--seeds", "0,1"];
+    let points = ["--epochs", "1,3", "--seeds", "0,1"];
     let table = sweep(&out, &points).succeeded().stdout;
     assert_eq!(table.lines().filter(|line| line.starts_with("| recording |")).count(), 2, "{table}");
     let csv = std::fs::read_to_string(out.join("sweep.csv")).unwrap();
     assert_eq!(csv.lines().count(), 5, "{csv}");
-    assert!(csv.contains("\"recording\",\"6 steps\",1,24,24,"), "{csv}");
+    assert!(csv.contains("\"recording\",\"3 epochs\",1,24,24,"), "{csv}");
     let svg = std::fs::read_to_string(out.join("curves.svg")).unwrap();
     assert!(svg.starts_with("<svg") && svg.contains("held-out PSNR, dB"));
 
     // One run is gone: it alone is made again.
     let runs = out.join("runs/recording");
     let made = |name: &str| std::fs::metadata(runs.join(name).join("map.ply")).unwrap().modified().unwrap();
-    let (kept, lost) = (made("2-steps-0"), made("6-steps-1"));
-    std::fs::remove_file(runs.join("6-steps-1/metrics.json")).unwrap();
+    let (kept, lost) = (made("1-epochs-0"), made("3-epochs-1"));
+    std::fs::remove_file(runs.join("3-epochs-1/metrics.json")).unwrap();
     sweep(&out, &points).succeeded();
-    assert_eq!(made("2-steps-0"), kept);
-    assert!(made("6-steps-1") > lost);
+    assert_eq!(made("1-epochs-0"), kept);
+    assert!(made("3-epochs-1") > lost);
 
     let same = compare(&out, &out).succeeded().stdout;
     assert!(!same.contains("worse") && !same.contains("better"), "{same}");
@@ -54,7 +54,7 @@ fn a_sweep_is_made_once_and_compared() {
 }
 
 #[test]
-fn presets_are_swept_with_their_own_steps_or_with_all() {
+fn presets_are_swept_with_their_own_epochs_or_with_all() {
     if skipped_without_adapter() {
         return;
     }
@@ -67,12 +67,12 @@ fn presets_are_swept_with_their_own_steps_or_with_all() {
     assert!(own.contains("\"recording\",\"balanced\",0,24,24,") && own.contains("\"quality\",0,"), "{own}");
     let settings = |run: &str| Config::read(&out.join("runs/recording").join(run).join("config.toml")).unwrap().mapping;
     let (usual, quality) = (MappingConfig::default(), settings("quality-0"));
-    assert_eq!(settings("balanced-0").iterations_per_keyframe, usual.iterations_per_keyframe);
-    assert!(quality.iterations_per_keyframe > usual.iterations_per_keyframe);
-    let all = csv_of(&["--presets", "quality", "--iterations", "2,3"]);
-    assert!(all.lines().count() == 3 && all.contains("\"quality, 2 steps\""), "{all}");
-    let few = settings("quality--3-steps-0");
-    assert_eq!((few.iterations_per_keyframe, few.insertion.detail), (3, quality.insertion.detail));
+    assert_eq!(settings("balanced-0").refine.final_epochs, usual.refine.final_epochs);
+    assert!(quality.refine.final_epochs > usual.refine.final_epochs);
+    let all = csv_of(&["--presets", "quality", "--epochs", "1,2"]);
+    assert!(all.lines().count() == 3 && all.contains("\"quality, 1 epochs\""), "{all}");
+    let few = settings("quality--2-epochs-0");
+    assert_eq!((few.refine.final_epochs, few.insertion.detail), (2, quality.insertion.detail));
 }
 
 #[test]

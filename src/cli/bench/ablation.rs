@@ -20,9 +20,9 @@ pub(super) struct AblationArgs {
     /// A variant: its name and the settings in which it differs, e.g. "no pruning: mapping.prune.min_opacity=0" (may be given again).
     #[arg(long = "variant", value_name = "NAME: KEY=VALUE …", value_parser = parse_variant)]
     variants: Vec<Variant>,
-    /// Steps after each keyframe: every variant is run with each of these numbers, which gives it a curve.
+    /// Epochs after the last keyframe: every variant is run with each of these numbers, which gives it a curve.
     #[arg(long, value_delimiter = ',')]
-    iterations: Vec<usize>,
+    epochs: Vec<usize>,
     /// Print a row about every so many steps of the refinement, too; the time of measuring is not counted.
     #[arg(long, value_name = "STEPS")]
     rows_every: Option<usize>,
@@ -44,7 +44,7 @@ pub(super) fn parse_variant(text: &str) -> Result<Variant, String> {
 #[derive(Debug, Serialize)]
 struct Row {
     variant: String,
-    iterations_per_keyframe: usize,
+    final_epochs: usize,
     mapping_s: f64,
     steps: usize,
     gaussians: usize,
@@ -52,9 +52,9 @@ struct Row {
 }
 
 impl Row {
-    fn new(variant: &Variant, iterations_per_keyframe: usize, mapped: &MappedLog, held_out: Option<ImageFigures>) -> Self {
+    fn new(variant: &Variant, final_epochs: usize, mapped: &MappedLog, held_out: Option<ImageFigures>) -> Self {
         let (mapping_s, steps, gaussians) = (mapped.wall_s, mapped.steps, mapped.cloud.len());
-        Self { variant: variant.name.clone(), iterations_per_keyframe, mapping_s, steps, gaussians, held_out }
+        Self { variant: variant.name.clone(), final_epochs, mapping_s, steps, gaussians, held_out }
     }
 }
 
@@ -68,17 +68,17 @@ pub(super) fn ablation(args: &AblationArgs) -> miette::Result<()> {
         variants.iter().map(|v| base.with_settings(&v.settings)).collect::<Result<_, _>>().into_diagnostic()?;
     std::fs::create_dir_all(&args.run.out).into_diagnostic()?;
     let log = TrackedLog::record(&recording, &Progress::default()).into_diagnostic()?;
-    println!("| variant | steps/keyframe | mapping s | steps | Gaussians | held-out PSNR dB | SSIM | depth L1 cm |");
+    println!("| variant | final epochs | mapping s | steps | Gaussians | held-out PSNR dB | SSIM | depth L1 cm |");
     println!("|---|---|---|---|---|---|---|---|");
     let mut rows = Vec::new();
     for (variant, config) in variants.iter().zip(configs) {
-        let own = [config.mapping.iterations_per_keyframe];
-        for &iterations in if args.iterations.is_empty() { &own } else { args.iterations.as_slice() } {
+        let own = [config.mapping.refine.final_epochs];
+        for &epochs in if args.epochs.is_empty() { &own } else { args.epochs.as_slice() } {
             let mut config = config.clone();
-            config.mapping.iterations_per_keyframe = iterations;
+            config.mapping.refine.final_epochs = epochs;
             let mut row = |mapped: &MappedLog| -> miette::Result<()> {
                 let held_out = held_out(&recording, &log, &gpu, mapped);
-                rows.push(Row::new(variant, iterations, mapped, held_out?));
+                rows.push(Row::new(variant, epochs, mapped, held_out?));
                 print(rows.last().expect("one was pushed"));
                 Ok(())
             };
@@ -120,6 +120,6 @@ fn print(row: &Row) {
         let (psnr, ssim) = (f.psnr_db.unwrap_or_default(), f.ssim.unwrap_or_default());
         format!("{psnr:.2} | {ssim:.4} | {depth}")
     });
-    let Row { variant, iterations_per_keyframe, mapping_s, steps, gaussians, .. } = row;
-    println!("| {variant} | {iterations_per_keyframe} | {mapping_s:.1} | {steps} | {gaussians} | {figures} |");
+    let Row { variant, final_epochs, mapping_s, steps, gaussians, .. } = row;
+    println!("| {variant} | {final_epochs} | {mapping_s:.1} | {steps} | {gaussians} | {figures} |");
 }

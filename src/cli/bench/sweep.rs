@@ -24,8 +24,8 @@ const SCENES: [(&str, &str); 3] = [
 ];
 /// Origin of a run, in its folder: an identical run is not repeated.
 const MADE_BY: &str = "made-by.json";
-/// Default, without numbers of steps or presets.
-const USUAL_STEPS: [usize; 4] = [12, 25, 50, 100];
+/// Default, without numbers of epochs or presets.
+const USUAL_EPOCHS: [usize; 4] = [4, 8, 17, 34];
 
 #[derive(Args)]
 pub(super) struct SweepArgs {
@@ -35,16 +35,16 @@ pub(super) struct SweepArgs {
     /// Folder for all runs, sweep.csv, sweep.json, sweep.md and curves.svg; a sweep that was interrupted goes on there.
     #[arg(short, long)]
     out: PathBuf,
-    /// Steps after each keyframe: each number is a point of the curves. 12, 25, 50 and 100 if there are no presets either.
+    /// Epochs after the last keyframe: each number is a point of the curves. 4, 8, 17 and 34 if there are no presets either.
     #[arg(long, value_delimiter = ',')]
-    iterations: Vec<usize>,
-    /// Presets of `keysplat run`: each is a point of the curves, with its own number of steps, or with all of --iterations.
+    epochs: Vec<usize>,
+    /// Presets of `keysplat run`: each is a point of the curves, with its own number of epochs, or with all of --epochs.
     #[arg(long, value_delimiter = ',', value_enum)]
     presets: Vec<Preset>,
     /// Seeds: each point is run with all of them.
     #[arg(long, value_delimiter = ',', default_values_t = [0u64])]
     seeds: Vec<u64>,
-    /// A variant: its name and the settings in which it differs, run with all presets and numbers of steps (may be given again).
+    /// A variant: its name and the settings in which it differs, run with all presets and numbers of epochs (may be given again).
     #[arg(long = "variant", value_name = "NAME: KEY=VALUE …", value_parser = parse_variant)]
     variants: Vec<Variant>,
     /// Options of `keysplat run` for all runs, e.g. -- --map-scale 0.5 --frames 0..200
@@ -103,14 +103,14 @@ pub(super) fn sweep(args: &SweepArgs, verbosity: Verbosity) -> miette::Result<()
     print(&table)
 }
 
-/// The runs that each sequence and seed gets, name and options: each variant with each preset and each number of steps.
+/// The runs that each sequence and seed gets, name and options: each variant with each preset and each number of epochs.
 fn settings(args: &SweepArgs) -> Vec<(String, Vec<String>)> {
     let plain = [Variant { name: String::new(), settings: Vec::new() }];
     let variants = if args.variants.is_empty() { &plain[..] } else { &args.variants };
     let mut presets: Vec<_> = args.presets.iter().copied().map(Some).collect();
-    let mut steps: Vec<_> = args.iterations.iter().copied().map(Some).collect();
-    if steps.is_empty() {
-        steps = if presets.is_empty() { USUAL_STEPS.map(Some).to_vec() } else { vec![None] };
+    let mut epochs: Vec<_> = args.epochs.iter().copied().map(Some).collect();
+    if epochs.is_empty() {
+        epochs = if presets.is_empty() { USUAL_EPOCHS.map(Some).to_vec() } else { vec![None] };
     }
     if presets.is_empty() {
         presets.push(None);
@@ -118,14 +118,13 @@ fn settings(args: &SweepArgs) -> Vec<(String, Vec<String>)> {
     let mut settings = Vec::new();
     for variant in variants {
         for preset in presets.iter().map(|preset| preset.and_then(|b| b.to_possible_value())) {
-            for steps in &steps {
+            for epochs in &epochs {
                 let preset = preset.as_ref().map(|value| value.get_name().to_owned());
                 let variant_name = Some(variant.name.clone()).filter(|name| !name.is_empty());
-                let names = [variant_name, preset.clone(), steps.map(|n| format!("{n} steps"))];
+                let names = [variant_name, preset.clone(), epochs.map(|n| format!("{n} epochs"))];
                 let mut options = preset.map_or_else(Vec::new, |name| vec!["--preset".into(), name]);
-                let of_steps = steps
-                    .map(|n| [format!("mapping.iterations_per_keyframe={n}"), format!("mapping.first_iterations={}", 2 * n)]);
-                for setting in of_steps.into_iter().flatten().chain(variant.settings.clone()) {
+                let of_epochs = epochs.map(|n| format!("mapping.refine.final_epochs={n}"));
+                for setting in of_epochs.into_iter().chain(variant.settings.clone()) {
                     options.extend(["--set".into(), setting]);
                 }
                 settings.push((names.into_iter().flatten().collect::<Vec<_>>().join(", "), options));

@@ -80,7 +80,7 @@ impl Default for DensityConfig {
     fn default() -> Self {
         Self {
             strategy: DensityStrategy::default(),
-            every: 1,
+            every: 2,
             views: 4,
             after_share: 0.6,
             min_opacity: 0.03,

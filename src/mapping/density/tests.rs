@@ -149,3 +149,83 @@ fn two_in_place_of_one_lie_along_its_longest_axis() {
         }
     }
 }
+
+#[test]
+fn thresholds_of_splitting_are_means_over_views_and_exclusive() {
+    let splits = |candidate: Candidate, config: &MultiViewConfig| {
+        let multi_view = MultiViewConfig { max_growth: 1.0, ..config.clone() };
+        let config = DensityConfig { multi_view, ..DensityConfig::default() };
+        !plan(&[candidate], 100, &config).children.is_empty()
+    };
+    let config = MultiViewConfig::default();
+    let with = |error_pixels: f32, absolute_gradient: f32| {
+        let score = GaussianScore { error_pixels, absolute_gradient, ..coarse().score };
+        Candidate { score, ..coarse() }
+    };
+    let (pixels, gradient) = (4.0 * config.error_pixels, 4.0 * config.absolute_gradient);
+    assert!(splits(with(1.01 * pixels, 1.01 * gradient), &config));
+    assert!(!splits(with(pixels, 1.01 * gradient), &config));
+    assert!(!splits(with(1.01 * pixels, gradient), &config));
+    let size = MultiViewConfig { split_pixels: coarse().pixels(), ..config };
+    assert!(!splits(coarse(), &size));
+    assert!(splits(coarse(), &MultiViewConfig { split_pixels: 0.99 * size.split_pixels, ..size }));
+}
+
+#[test]
+fn thresholds_of_pruning_are_exclusive() {
+    let config = DensityConfig::default();
+    let MultiViewConfig { min_weight, min_contribution, .. } = config.multi_view;
+    let at = |best_weight: f32, contribution: f32| Candidate {
+        history: GaussianHistory { best_weight, contribution, ..good().history },
+        ..good()
+    };
+    let all = [at(min_weight, 9.0), at(0.99 * min_weight, 9.0), at(0.5, min_contribution), at(0.5, 0.99 * min_contribution)];
+    assert_eq!(plan(&all, 100, &config).keep, [0, 2]);
+}
+
+#[test]
+fn of_the_faint_the_half_in_the_way_goes() {
+    let faint = |weighted_error_pixels: f32| {
+        let score = GaussianScore { weighted_error_pixels, ..good().score };
+        shaped(Candidate { score, ..good() }, |g| g.raw_opacity = raw_opacity_from_opacity(0.08))
+    };
+    let all = [1.0, 5.0, 3.0, 4.0, 2.0].map(faint);
+    assert_eq!(plan(&all, 100, &DensityConfig::default()).keep, [0, 2, 4]);
+    // An opacity at the threshold is not faint.
+    let multi_view = MultiViewConfig { faint_opacity: all[0].opacity(), ..MultiViewConfig::default() };
+    assert_eq!(plan(&all, 100, &DensityConfig { multi_view, ..DensityConfig::default() }).keep, [0, 1, 2, 3, 4]);
+}
+
+#[test]
+fn without_growth_nothing_is_divided() {
+    for strategy in [DensityStrategy::MultiView, DensityStrategy::Classic] {
+        let multi_view = MultiViewConfig { max_growth: 1.0, ..MultiViewConfig::default() };
+        let config = DensityConfig { strategy, multi_view, ..DensityConfig::default() };
+        assert!(!plan(&[coarse()], 100, &config).children.is_empty());
+        assert!(plan(&[coarse()], 100, &config.without_growth()).children.is_empty());
+        assert_eq!(config.without_growth().strategy, strategy);
+    }
+}
+
+#[test]
+fn values_out_of_range_are_refused() {
+    let refused = |change: fn(&mut DensityConfig)| {
+        let mut config = DensityConfig::default();
+        change(&mut config);
+        config.validate().is_err()
+    };
+    assert_eq!(DensityConfig::default().validate(), Ok(()));
+    let changes: [fn(&mut DensityConfig); 9] = [
+        |c| c.every = 0,
+        |c| c.views = 0,
+        |c| c.after_share = 1.1,
+        |c| c.min_opacity = 1.0,
+        |c| c.max_scale_metres = 0.0,
+        |c| c.max_scale_metres = f32::INFINITY,
+        |c| c.classic.split_pixels = -1.0,
+        |c| c.multi_view.error_ratio = f32::NAN,
+        |c| c.classic.gradient = -0.1,
+    ];
+    assert!(changes.into_iter().all(refused));
+    assert!(!refused(|c| (c.multi_view.error_pixels, c.classic.gradient) = (0.0, 0.0)), "zero is a threshold");
+}

@@ -1,8 +1,8 @@
 //! Density control: steps that score the Gaussians, and the change that the scores lead to.
 
-use super::{Mapper, MappingError, Step};
+use super::{Mapper, Step};
 use crate::mapping::density::{self, Candidate};
-use crate::mapping::{DensityConfig, DensityStrategy};
+use crate::mapping::{DensityConfig, DensityStrategy, MappingError};
 use crate::optimise::{AdamConfig, ErrorPixels, GaussianScore};
 
 impl Mapper {

@@ -1,4 +1,4 @@
-//! Consolidation: steps over all keyframes. Each epoch draws every keyframe with an image once, in a seeded shuffle.
+//! Consolidation: steps over all keyframes. Each epoch draws every keyframe once, in a seeded shuffle.
 //!
 //! Online sessions follow keyframes at constant rates. The final refinement follows the last keyframe: steps at half size first, then at full
 //! size, with density control in between; rates fall exponentially, as 3DGS has it for positions.
@@ -7,10 +7,10 @@ use std::time::Instant;
 
 use serde::{Deserialize, Serialize};
 
-use crate::mapping::{DensityConfig, RefineConfig};
+use crate::mapping::{DensityConfig, MappingError, RefineConfig};
 use crate::optimise::{AdamConfig, StepReport};
 
-use super::{BATCH, Mapper, MappingError, Step};
+use super::{BATCH, Mapper, Step};
 
 /// Fewer keyframes are all in the window; an online session would repeat its steps.
 const FIRST_SESSION: usize = 8;
@@ -105,9 +105,9 @@ impl Mapper {
         }
     }
 
-    /// Keyframes with images, ascending.
+    /// All keyframes, ascending.
     fn views(&self) -> Vec<usize> {
-        (0..self.keyframes.len()).filter(|&k| self.keyframes[k].has_image()).collect()
+        (0..self.keyframes.len()).collect()
     }
 
     fn consolidation_steps(&mut self, batch: &[Step], adam: &AdamConfig) -> Result<Vec<StepReport>, MappingError> {

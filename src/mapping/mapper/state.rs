@@ -6,11 +6,11 @@ use std::time::Duration;
 use fastrand::Rng;
 use serde::{Deserialize, Serialize};
 
-use super::{FinalRefinement, Mapper, MappingError};
+use super::{FinalRefinement, Mapper};
 use crate::gpu::Gpu;
 use crate::mapping::gaussian_stats::GaussianStats;
 use crate::mapping::keyframe::{KeyframeState, MappedKeyframe};
-use crate::mapping::{Keyframe, MappingConfig};
+use crate::mapping::{Keyframe, MappingConfig, MappingError};
 use crate::optimise::TrainerState;
 use crate::render::{CloudState, GpuCloud};
 
@@ -23,7 +23,7 @@ pub struct MapperState {
     keyframes: Vec<KeyframeState>,
     rng: u64,
     step_times: Vec<Duration>,
-    /// Keyframes with images at the last online session.
+    /// Keyframes at the last online session.
     consolidated: usize,
     refinement: Option<FinalRefinement>,
 }
@@ -38,7 +38,7 @@ impl Mapper {
             cloud: self.cloud.state(&self.gpu)?,
             trainer: self.trainer.state(),
             stats: self.stats.clone(),
-            keyframes: self.keyframes.iter().map(|keyframe| keyframe.state(&self.gpu)).collect::<Result<_, _>>()?,
+            keyframes: self.keyframes.iter().map(|keyframe| keyframe.state(&self.gpu, &self.images)).collect::<Result<_, _>>()?,
             rng: self.rng.get_seed(),
             step_times: self.step_times.clone(),
             consolidated: self.consolidated,
@@ -77,7 +77,7 @@ impl Mapper {
         }
         let then = state.keyframes.get(self.keyframes.len()).filter(|then| then.id == keyframe.id).ok_or_else(not_the_same)?;
         let with_half = self.config.learns_at_half_size();
-        let mapped = MappedKeyframe::restore(&self.gpu, then, keyframe, with_half)?;
+        let mapped = MappedKeyframe::restore(&self.gpu, &mut self.images, then, keyframe, with_half)?;
         self.keyframes.push(mapped.ok_or_else(not_the_same)?);
         Ok(())
     }

@@ -2,8 +2,9 @@
 
 use super::{Sink, StepLog, Trainer};
 use crate::gpu::{GpuBuffer, IndirectSize};
+use crate::optimise::LossConfig;
 use crate::optimise::image_buffers::LOSS_TILE;
-use crate::optimise::{LossConfig, TargetImage};
+use crate::optimise::loss::{GpuPixels, ssim_phase};
 use crate::render::layout::{Counter, LossSetup, VISIBLE_COUNTER};
 use crate::render::{GpuCloud, PreparedView};
 
@@ -20,10 +21,22 @@ impl Trainer {
 
     pub(super) fn encode_loss(&self, pass: &mut wgpu::ComputePass<'_>, loss: &LossConfig, depth_confidence: f32) {
         let (gpu, ws, k) = (self.rasterizer.gpu(), &self.rasterizer.workspace, &self.kernels);
-        let TargetImage { width, height, color, depth, .. } = &self.images[0].target;
-        let (width, height) = (*width, *height);
+        let ((width, height), GpuPixels { color, depth }) = (self.images[0].size, &self.images[0].target);
         let LossConfig { ssim_weight, depth_weight, precise_depth_metres: precise_depth } = *loss;
-        let setup = LossSetup { width, height, ssim_weight, depth_weight, precise_depth, depth_confidence };
+        let [phase_x, phase_y] = ssim_phase(self.steps);
+        let windows = |size: u32, phase: u32| (size + 1 - phase) / 2;
+        let pixels_per_window = (width * height) as f32 / (windows(width, phase_x) * windows(height, phase_y)).max(1) as f32;
+        let setup = LossSetup {
+            width,
+            height,
+            ssim_weight,
+            depth_weight,
+            precise_depth,
+            depth_confidence,
+            phase_x,
+            phase_y,
+            pixels_per_window,
+        };
         self.loss_setup.write(gpu, 0, &[setup]);
         let forward = [width.div_ceil(LOSS_TILE), height.div_ceil(LOSS_TILE / 2), 1];
         let backward = [width.div_ceil(LOSS_TILE), height.div_ceil(LOSS_TILE), 1];

@@ -26,6 +26,8 @@ pub struct LossWeights {
     pub depth: f64,
     /// Depth beyond which its weight falls with the square, metres.
     pub precise_depth: f64,
+    /// First pixel with a window of SSIM along x and y: windows lie at every second pixel of every second row.
+    pub phase: [usize; 2],
 }
 
 const C1: f64 = 0.01 * 0.01;
@@ -69,11 +71,12 @@ pub fn loss(image: &Image64, target: &Target64, weights: &LossWeights) -> (f64, 
     for channel in 0..3 {
         let x: Vec<f64> = image.color.iter().map(|c| c[channel]).collect();
         let y: Vec<f64> = target.color.iter().map(|c| c[channel]).collect();
-        let (ssim, by_x) = ssim(target.width, target.height, &x, &y);
+        let (ssim, by_x) = mean_ssim(target.width, target.height, &x, &y, weights.phase);
+        value += weights.ssim * (1.0 - ssim) / 3.0;
         for i in 0..pixels {
-            value += ((1.0 - weights.ssim) * (x[i] - y[i]).abs() + weights.ssim * (1.0 - ssim[i])) * per_pixel / 3.0;
+            value += (1.0 - weights.ssim) * (x[i] - y[i]).abs() * per_pixel / 3.0;
             let sign = if x[i] == y[i] { 0.0 } else { (x[i] - y[i]).signum() };
-            gradient.color[i][channel] = ((1.0 - weights.ssim) * sign - weights.ssim * by_x[i]) * per_pixel / 3.0;
+            gradient.color[i][channel] = ((1.0 - weights.ssim) * sign - weights.ssim * by_x[i] * pixels as f64) * per_pixel / 3.0;
         }
     }
     for i in (0..pixels).filter(|&i| target.depth[i] > 0.0) {
@@ -87,32 +90,35 @@ pub fn loss(image: &Image64, target: &Target64, weights: &LossWeights) -> (f64, 
     (value, gradient)
 }
 
-/// SSIM at each pixel, and the gradient of its sum by `x`.
-fn ssim(width: usize, height: usize, x: &[f64], y: &[f64]) -> (Vec<f64>, Vec<f64>) {
+/// Mean SSIM of the windows of a phase, and its gradient by `x`.
+fn mean_ssim(width: usize, height: usize, x: &[f64], y: &[f64], phase: [usize; 2]) -> (f64, Vec<f64>) {
     let product = |a: &[f64], b: &[f64]| -> Vec<f64> { a.iter().zip(b).map(|(a, b)| a * b).collect() };
     let filter = |values: &[f64]| blur(width, height, values);
     let (mx, my) = (filter(x), filter(y));
     let (xx, yy, xy) = (filter(&product(x, x)), filter(&product(y, y)), filter(&product(x, y)));
-    let mut value = vec![0.0; x.len()];
+    let is_window = |i: &usize| i % width % 2 == phase[0] && i / width % 2 == phase[1];
+    let per_window = 1.0 / (0..x.len()).filter(is_window).count().max(1) as f64;
+    let mut mean = 0.0;
     let mut partials = [vec![0.0; x.len()], vec![0.0; x.len()], vec![0.0; x.len()]];
-    for i in 0..x.len() {
+    for i in (0..x.len()).filter(is_window) {
         let a1 = 2.0 * mx[i] * my[i] + C1;
         let a2 = 2.0 * (xy[i] - mx[i] * my[i]) + C2;
         let b1 = mx[i] * mx[i] + my[i] * my[i] + C1;
         let raw = xx[i] + yy[i] - mx[i] * mx[i] - my[i] * my[i];
         let b2 = raw.max(0.0) + C2;
-        value[i] = a1 * a2 / (b1 * b2);
+        let value = a1 * a2 / (b1 * b2);
+        mean += value * per_window;
         // log-derivatives of the four factors, by the mean, the mean square and the mean product.
         let free = if raw > 0.0 { 1.0 } else { 0.0 };
-        partials[1][i] = -value[i] / b2 * free;
-        partials[2][i] = 2.0 * value[i] / a2;
+        partials[1][i] = -value / b2 * free;
+        partials[2][i] = 2.0 * value / a2;
         if a2 == 0.0 {
             partials[2][i] = 2.0 * a1 / (b1 * b2);
         }
         partials[0][i] =
-            2.0 * my[i] * a2 / (b1 * b2) - 2.0 * mx[i] * value[i] / b1 - 2.0 * mx[i] * partials[1][i] - my[i] * partials[2][i];
+            2.0 * my[i] * a2 / (b1 * b2) - 2.0 * mx[i] * value / b1 - 2.0 * mx[i] * partials[1][i] - my[i] * partials[2][i];
     }
     let [by_mean, by_square, by_product] = partials.map(|p| filter(&p));
-    let by_x = (0..x.len()).map(|i| by_mean[i] + 2.0 * x[i] * by_square[i] + y[i] * by_product[i]).collect();
-    (value, by_x)
+    let by_x = (0..x.len()).map(|i| per_window * (by_mean[i] + 2.0 * x[i] * by_square[i] + y[i] * by_product[i])).collect();
+    (mean, by_x)
 }

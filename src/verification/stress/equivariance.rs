@@ -15,7 +15,7 @@ use super::scenes::{self, Fault, Scene};
 use super::{Family, Machine, Outcome, Part};
 use crate::geometry::Se3;
 use crate::gpu::GpuError;
-use crate::optimise::{AdamConfig, LossConfig, TargetImage, TrainingView};
+use crate::optimise::{AdamConfig, LossConfig, TargetImage, Trainer, TrainingView};
 use crate::splat::{Gaussian, GaussianCloud, ShDegree};
 use crate::verification::reference::{Gaussian64, cloud64};
 
@@ -88,12 +88,12 @@ struct Run {
 fn run(machine: &Machine, scene: &Scene, target: &TargetImage, loss: &LossConfig) -> Result<Run, GpuError> {
     let on_gpu = machine.upload(&scene.cloud)?;
     let view = TrainingView::new(scene.camera, target);
-    machine.with(1, |trainer| {
-        let gradient = trainer.gradients(&on_gpu, &scene.camera, target, loss)?.cloud;
-        let reports = trainer.steps(&on_gpu, &[view; STEPS], loss, &AdamConfig::default())?;
-        let losses = reports.iter().map(|r| f64::from(r.loss.total(loss))).collect();
-        Ok(Run { map: on_gpu.download(&machine.gpu)?, losses, gradient: cloud64(&gradient) })
-    })
+    // A new one each time: the number of steps so far decides on the windows of SSIM.
+    let mut trainer = Trainer::new(machine.gpu.clone())?;
+    let gradient = trainer.gradients(&on_gpu, &scene.camera, target, loss)?.cloud;
+    let reports = trainer.steps(&on_gpu, &[view; STEPS], loss, &AdamConfig::default())?;
+    let losses = reports.iter().map(|r| f64::from(r.loss.total(loss))).collect();
+    Ok(Run { map: on_gpu.download(&machine.gpu)?, losses, gradient: cloud64(&gradient) })
 }
 
 /// A scene to fit another one's picture with, its harmonics constant: higher ones are not turned.
