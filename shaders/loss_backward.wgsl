@@ -40,6 +40,7 @@ fn main(
     var wanted: array<vec4<f32>, 4>;
     for (var k = 0u; k < end; k++) {
         rendered[k] = color_depth[(y + k) * setup.width + x];
+        // A is 0 where nothing was recorded.
         wanted[k] = unpack4x8unorm(target_color[(y + k) * setup.width + x]);
     }
     for (var channel = 0u; channel < 3u; channel++) {
@@ -56,7 +57,8 @@ fn main(
         for (var k = 0u; k < end; k++) {
             let ssim = dot(filtered.at[k].xyz, vec3(1.0, 2.0 * rendered[k][channel], wanted[k][channel]));
             let l1 = sign(rendered[k][channel] - wanted[k][channel]);
-            gradient[k][channel] = ((1.0 - setup.ssim_weight) * l1 - setup.ssim_weight * setup.pixels_per_window * ssim) * per_pixel / 3.0;
+            let by_color = (1.0 - setup.ssim_weight) * l1 - setup.ssim_weight * setup.pixels_per_window * ssim;
+            gradient[k][channel] = wanted[k].w * by_color * per_pixel / 3.0;
         }
     }
     for (var k = 0u; k < end; k++) {
@@ -69,7 +71,7 @@ fn main(
             gradient_alpha = -gradient[k].w * measured;
         }
         image_gradients[index] = gradient[k];
-        let error = abs(rendered[k].xyz - wanted[k].xyz);
+        let error = wanted[k].w * abs(rendered[k].xyz - wanted[k].xyz);
         image_gradients[pixels + index] = vec4(gradient_alpha, (error.x + error.y + error.z) / 3.0, 0.0, 0.0);
     }
 }

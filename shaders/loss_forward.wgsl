@@ -5,7 +5,7 @@
 // [H, W] rendered (r, g, b, Σ w z); (transmittance, -).
 @group(0) @binding(1) var<storage, read> color_depth: array<vec4<f32>>;
 @group(0) @binding(2) var<storage, read> state: array<vec2<f32>>;
-// [H, W] the keyframe: 8-bit RGBA, and sensor depth in metres (0: not measured).
+// [H, W] the keyframe: 8-bit RGBA, all 0 where nothing was recorded; and sensor depth in metres (0: not measured).
 @group(0) @binding(3) var<storage, read> target_color: array<u32>;
 @group(0) @binding(4) var<storage, read> target_depth: array<f32>;
 // [3 channels, bordered windows along y, along x] ∂SSIM/∂(mean, mean square, mean product), zero where there is no window.
@@ -28,7 +28,8 @@ struct Ssim {
     by_product: vec3<f32>,
 }
 
-// A workgroup covers a tile, 16×8 pixels, and an invocation one window and four pixels. Windows of a tile that is left out do not count.
+// A workgroup covers a tile, 16×8 pixels, and an invocation one window and four pixels. Windows of a tile that is left out do not count, and
+// those at pixels that were not recorded are perfect. Such pixels are zero in both images, as those beyond the border are.
 @compute @workgroup_size(32)
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
@@ -53,13 +54,16 @@ fn main(
     workgroupBarrier();
     let at = window.y * 16u + window.x;
     let ssim = ssim_of(filter_column(at), filter_column(136u + at), filter_column(272u + at));
-    let is_inside = first.x + 2u * window.x + setup.phase_x < setup.width && first.y + 2u * window.y + setup.phase_y < setup.height;
-    let weight = select(0.0, 1.0, is_inside);
+    let center = first + 2u * window + vec2(setup.phase_x, setup.phase_y);
+    let is_inside = center.x < setup.width && center.y < setup.height;
+    let is_recorded = target_color[select(0u, center.y * setup.width + center.x, is_inside)] != 0u;
+    let weight = select(0.0, 1.0, is_inside && is_recorded);
     for (var channel = 0u; channel < 3u; channel++) {
         partials[channel * plane + to] = weight * vec4(ssim.by_mean[channel], ssim.by_square[channel], ssim.by_product[channel], 0.0);
     }
     var sum = vec4(0.0);
-    sum.y = weight * setup.pixels_per_window * (ssim.value.x + ssim.value.y + ssim.value.z);
+    let similarity = select(3.0, ssim.value.x + ssim.value.y + ssim.value.z, is_recorded);
+    sum.y = select(0.0, setup.pixels_per_window * similarity, is_inside);
     // Four pixels of one column.
     let x = first.x + local % 16u;
     let y = first.y + local / 16u * 4u;
@@ -69,7 +73,8 @@ fn main(
         }
         let index = (y + k) * setup.width + x;
         let rendered = color_depth[index];
-        let error = rendered.xyz - unpack4x8unorm(target_color[index]).xyz;
+        let wanted = unpack4x8unorm(target_color[index]);
+        let error = wanted.w * (rendered.xyz - wanted.xyz);
         let measured = target_depth[index];
         sum.x += abs(error.x) + abs(error.y) + abs(error.z);
         sum.w += dot(error, error);
@@ -105,8 +110,8 @@ fn add_pixel(
 ) {
     let inside = x >= 0 && y >= 0 && x < i32(setup.width) && y < i32(setup.height);
     let index = select(0u, u32(y) * setup.width + u32(x), inside);
-    let rendered = select(vec3(0.0), color_depth[index].xyz, inside);
-    let wanted = select(vec3(0.0), unpack4x8unorm(target_color[index]).xyz, inside);
+    let wanted = select(vec4(0.0), unpack4x8unorm(target_color[index]), inside);
+    let rendered = select(vec3(0.0), color_depth[index].xyz, wanted.w > 0.0);
     add(red, quantities(rendered.x, wanted.x), taps);
     add(green, quantities(rendered.y, wanted.y), taps);
     add(blue, quantities(rendered.z, wanted.z), taps);

@@ -7,6 +7,8 @@
 //!
 //! Left out: LPIPS, which needs a network's weights.
 
+use std::sync::Arc;
+
 use ::image::RgbImage;
 
 /// The window reaches this many pixels to each side: `int(3.5 σ + 0.5)` for σ = 1.5.
@@ -27,6 +29,8 @@ pub struct ImageF32 {
     pub height: usize,
     /// Row-major `[height * width]`, RGB in [0, 1].
     pub pixels: Vec<[f32; 3]>,
+    /// `[height * width]` the pixels that the camera recorded; `None`: all of them.
+    valid: Option<Arc<[bool]>>,
 }
 
 /// Images that cannot be compared.
@@ -53,14 +57,27 @@ pub enum ImageError {
 impl ImageF32 {
     /// `None` unless there are `width * height` pixels.
     pub fn new(width: usize, height: usize, pixels: Vec<[f32; 3]>) -> Option<Self> {
-        (width.checked_mul(height) == Some(pixels.len())).then_some(Self { width, height, pixels })
+        (width.checked_mul(height) == Some(pixels.len())).then_some(Self { width, height, pixels, valid: None })
     }
 
     /// 0..255 to [0, 1].
     pub fn from_rgb8(image: &RgbImage) -> Self {
         let (width, height) = image.dimensions();
         let pixels = image.pixels().map(|pixel| pixel.0.map(|value| f32::from(value) / 255.0)).collect();
-        Self { width: width as usize, height: height as usize, pixels }
+        Self { width: width as usize, height: height as usize, pixels, valid: None }
+    }
+
+    /// Leaves out the pixels that are not `valid` `[height * width]`: they become black, and no comparison with the image counts them.
+    pub fn masked(mut self, valid: Option<&Arc<[bool]>>) -> Self {
+        let Some(valid) = valid else { return self };
+        assert_eq!(valid.len(), self.pixels.len(), "the mask has the size of the image");
+        self.pixels.iter_mut().zip(valid.iter()).filter(|(_, valid)| !**valid).for_each(|(pixel, _)| *pixel = [0.0; 3]);
+        self.valid = Some(valid.clone());
+        self
+    }
+
+    fn is_valid(&self, i: usize) -> bool {
+        self.valid.as_ref().is_none_or(|valid| valid[i])
     }
 
     /// Clamps every value to [0, 1], what a screen would show: for rendered images, before any comparison. NaN becomes 0.
@@ -77,7 +94,7 @@ impl ImageF32 {
     }
 }
 
-/// Peak signal-to-noise ratio over all pixels and channels, dB, for a peak of 1; infinite for equal images.
+/// Peak signal-to-noise ratio over the recorded image's valid pixels and all channels, dB, for a peak of 1; infinite for equal images.
 ///
 /// # Errors
 /// [`ImageError::Size`] if the images differ in size.
@@ -97,7 +114,8 @@ pub fn psnr_where_lit(rendered: &ImageF32, recorded: &ImageF32) -> Result<f64, I
 fn psnr_where(rendered: &ImageF32, recorded: &ImageF32, counts: impl Fn(f32) -> bool) -> Result<f64, ImageError> {
     rendered.check_same_size(recorded)?;
     let (mut sum, mut count) = (0.0, 0usize);
-    for (&a, &b) in rendered.pixels.as_flattened().iter().zip(recorded.pixels.as_flattened()) {
+    let valid = (0..recorded.pixels.len()).filter(|&i| recorded.is_valid(i));
+    for (a, b) in valid.flat_map(|i| rendered.pixels[i].into_iter().zip(recorded.pixels[i])) {
         if counts(b) {
             sum += (f64::from(a) - f64::from(b)).powi(2);
             count += 1;
@@ -106,21 +124,25 @@ fn psnr_where(rendered: &ImageF32, recorded: &ImageF32, counts: impl Fn(f32) -> 
     Ok(-10.0 * (sum / count.max(1) as f64).log10())
 }
 
-/// Structural similarity, the mean over RGB and over the pixels whose whole window is inside the image.
+/// Structural similarity, the mean over RGB and over the recorded image's valid pixels whose whole window is inside the image.
 ///
 /// # Errors
 /// [`ImageError::Size`] if the images differ in size, [`ImageError::TooSmall`] if they are smaller than the window.
-pub fn ssim(a: &ImageF32, b: &ImageF32) -> Result<f64, ImageError> {
-    a.check_same_size(b)?;
-    let (width, height) = (a.width, a.height);
+pub fn ssim(rendered: &ImageF32, recorded: &ImageF32) -> Result<f64, ImageError> {
+    rendered.check_same_size(recorded)?;
+    let (width, height) = (recorded.width, recorded.height);
     if width < WINDOW || height < WINDOW {
         return Err(ImageError::TooSmall { width, height });
     }
-    let sum: f64 = (0..3).map(|channel| ssim_sum(a, b, channel)).sum();
-    Ok(sum / (3 * (width - 2 * RADIUS) * (height - 2 * RADIUS)) as f64)
+    let blanked = recorded.valid.as_ref().map(|valid| rendered.clone().masked(Some(valid)));
+    let rendered = blanked.as_ref().unwrap_or(rendered);
+    let sum: f64 = (0..3).map(|channel| ssim_sum(rendered, recorded, channel)).sum();
+    let inner = (RADIUS..height - RADIUS).flat_map(|y| (RADIUS..width - RADIUS).map(move |x| y * width + x));
+    let count = inner.filter(|&i| recorded.is_valid(i)).count();
+    Ok(sum / (3 * count.max(1)) as f64)
 }
 
-/// The sum of one channel's SSIM over all inner pixels. A ring of filtered rows keeps the working set in the cache.
+/// The sum of one channel's SSIM over the inner pixels that are valid in `b`. A ring of filtered rows keeps the working set in the cache.
 fn ssim_sum(a: &ImageF32, b: &ImageF32, channel: usize) -> f64 {
     let weights = window();
     let (width, inner) = (a.width, a.width - 2 * RADIUS);
@@ -148,7 +170,8 @@ fn ssim_sum(a: &ImageF32, b: &ImageF32, channel: usize) -> f64 {
             // The oldest row lies right after the newest in the ring.
             filter(&weights, std::array::from_fn(|k| ring[(y + 1 + k) % WINDOW][quantity].as_slice()), out);
         }
-        sum += ssim_row(&filtered);
+        let first = (y - RADIUS) * width + RADIUS;
+        sum += ssim_row(&filtered, |x| b.is_valid(first + x));
     }
     sum
 }
@@ -166,9 +189,9 @@ fn filter(weights: &[f64; RADIUS + 1], taps: [&[f64]; WINDOW], out: &mut [f64]) 
     }
 }
 
-fn ssim_row([mean_a, mean_b, squares, product]: &[Vec<f64>; 4]) -> f64 {
+fn ssim_row([mean_a, mean_b, squares, product]: &[Vec<f64>; 4], counts: impl Fn(usize) -> bool) -> f64 {
     let mut sum = 0.0;
-    for i in 0..mean_a.len() {
+    for i in (0..mean_a.len()).filter(|&i| counts(i)) {
         let (ua, ub) = (mean_a[i], mean_b[i]);
         let means = ua * ua + ub * ub;
         let variances = squares[i] - means;
@@ -222,6 +245,41 @@ mod tests {
         // Four values differ by 0.1, two are black.
         assert!((psnr_where_lit(&rendered, &recorded).unwrap() - 20.0).abs() < 1e-5);
         assert!(psnr(&rendered, &recorded).unwrap() < 10.0);
+    }
+
+    /// Whatever is rendered where nothing was recorded, the figures are those of the rest.
+    #[test]
+    fn invalid_pixels_do_not_count() {
+        let noise = |seed: u64| {
+            let mut rng = fastrand::Rng::with_seed(seed);
+            ImageF32::new(24, 14, (0..24 * 14).map(|_| [rng.f32(), rng.f32(), rng.f32()]).collect()).unwrap()
+        };
+        let valid: Arc<[bool]> = (0..24 * 14).map(|i| i % 24 < 18).collect();
+        let (rendered, recorded) = (noise(1), noise(2).masked(Some(&valid)));
+        let mut other = rendered.clone();
+        (0..24 * 14).filter(|&i| !valid[i]).for_each(|i| other.pixels[i] = [1.0; 3]);
+        assert_ne!(rendered, other);
+        for figure in [psnr, psnr_where_lit, ssim] {
+            assert_eq!(figure(&rendered, &recorded), figure(&other, &recorded));
+        }
+        let cut = |image: &ImageF32| {
+            let pixels = (0..24 * 14).filter(|&i| valid[i]).map(|i| image.pixels[i]).collect();
+            ImageF32::new(18, 14, pixels).unwrap()
+        };
+        let expected = psnr(&cut(&rendered), &cut(&recorded)).unwrap();
+        assert!((psnr(&rendered, &recorded).unwrap() - expected).abs() < 1e-9);
+        // Windows that reach over the border see it black in both images.
+        let blanked = rendered.clone().masked(Some(&valid));
+        let windows = |valid: &dyn Fn(usize) -> bool| {
+            let mut only = recorded.clone();
+            only.valid = Some((0..24 * 14).map(valid).collect());
+            ssim_sum(&blanked, &only, 0)
+        };
+        let sum: f64 = (0..18).map(|x| windows(&|i| i % 24 == x)).sum();
+        let all: f64 = (0..3).map(|channel| ssim_sum(&blanked, &recorded, channel)).sum();
+        assert!((ssim_sum(&blanked, &recorded, 0) - sum).abs() < 1e-9);
+        assert!((ssim(&rendered, &recorded).unwrap() - all / (3 * 4 * 13) as f64).abs() < 1e-9);
+        assert!((ssim(&recorded, &recorded).unwrap() - 1.0).abs() < 1e-9);
     }
 
     #[test]

@@ -1,6 +1,7 @@
 //! Renders the final map at estimated poses and compares with what the camera recorded, by the three protocols in use.
 //!
-//! Images are compared at the mapping resolution, without lens distortion, with the camera's own principal point.
+//! Images are compared at the mapping resolution, without lens distortion, with the camera's own principal point, over the pixels that the
+//! camera recorded.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -53,7 +54,7 @@ pub struct ViewRecord {
     pub frame: usize,
     /// `null` where both images are equal.
     pub psnr_db: Option<f64>,
-    /// SSIM over all pixels.
+    /// SSIM over the recorded pixels.
     pub ssim: f64,
     /// Where the sensor has depth.
     pub depth_l1_m: Option<f64>,
@@ -180,7 +181,7 @@ pub fn evaluate_views(
 fn compare(rendered: &Rendered, recorded: &RectifiedImage) -> ViewFigures {
     let pixels = rendered.color_depth.iter().map(|p| [p[0], p[1], p[2]]).collect();
     let image = ImageF32::new(rendered.width as usize, rendered.height as usize, pixels).expect("one colour a pixel").clamped();
-    let truth = ImageF32::from_rgb8(&recorded.color);
+    let truth = ImageF32::from_rgb8(&recorded.color).masked(recorded.valid.as_ref());
     let same_size = "both are at the mapping resolution";
     let depth: Vec<f32> = (0..rendered.color_depth.len()).map(|i| rendered.expected_depth(i)).collect();
     ViewFigures {
@@ -245,7 +246,7 @@ mod tests {
         assert!(bytes.dimensions() == (SIZE, SIZE) && bytes.pixels().all(|p| p.0 == [255, 51, 0]));
         let pinhole = Pinhole { fx: 16.0, fy: 16.0, cx: 8.0, cy: 8.0, width: SIZE, height: SIZE };
         let depth = DepthImage { width: SIZE, height: SIZE, metres: vec![2.5; pixels] };
-        let mut recorded = RectifiedImage { pinhole, color: bytes, depth: Some(depth) };
+        let mut recorded = RectifiedImage { pinhole, color: bytes, depth: Some(depth), valid: None };
         let f = compare(&rendered, &recorded);
         assert!(f.psnr > 100.0 && f.psnr_lit > 100.0 && f.ssim > 0.999, "equal colours");
         assert!((f.depth_l1.unwrap() - 0.5).abs() < 1e-6);
@@ -253,6 +254,8 @@ mod tests {
         let f = compare(&rendered, &recorded);
         assert!((f.psnr - 10.0 * f64::from(3 * SIZE * SIZE).log10()).abs() < 1e-3, "one channel of one pixel is off by one");
         assert!(f.ssim < 0.9999);
+        recorded.valid = Some((0..pixels).map(|i| i != 8 * SIZE as usize + 8).collect());
+        assert!(compare(&rendered, &recorded).psnr > 100.0, "the pixel was not recorded");
     }
 
     #[test]

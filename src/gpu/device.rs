@@ -2,6 +2,7 @@
 
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
 
 use serde::Serialize;
 use wgpu::{Backends, InstanceDescriptor, InstanceFlags};
@@ -66,6 +67,15 @@ pub enum GpuError {
     /// The device was lost, or a command failed.
     #[error("the GPU device failed: {0}")]
     Failed(String),
+    /// Submitted work did not end in time.
+    #[error(
+        "the GPU has not finished its work within {} s and counts as hung; restart the machine or its graphics driver, or choose another adapter with --gpu",
+        waited.as_secs()
+    )]
+    Hung {
+        /// Time waited.
+        waited: Duration,
+    },
 }
 
 /// Identity of an adapter in metrics and lists.
@@ -117,7 +127,11 @@ pub struct Gpu {
 enum Failure {
     OutOfMemory(String),
     Failed(String),
+    Hung(Duration),
 }
+
+/// A batch of steps takes seconds even on a software adapter.
+const MAX_WAIT: Duration = Duration::from_secs(600);
 
 /// Bytes in our buffers, now and at most.
 #[derive(Debug, Default)]
@@ -269,17 +283,31 @@ impl Gpu {
     pub fn check(&self) -> Result<(), GpuError> {
         match &*self.failure.lock().unwrap_or_else(PoisonError::into_inner) {
             None => Ok(()),
+            Some(Failure::Hung(waited)) => Err(GpuError::Hung { waited: *waited }),
             Some(Failure::OutOfMemory(what)) => Err(GpuError::OutOfMemory(what.clone())),
             Some(Failure::Failed(what)) => Err(GpuError::Failed(what.clone())),
         }
     }
 
-    /// Waits until everything submitted is done.
+    /// Waits until everything submitted is done, for ten minutes at most.
     ///
     /// # Errors
-    /// [`GpuError`] if the device failed.
+    /// [`GpuError`] if the device failed, or hangs.
     pub fn wait(&self) -> Result<(), GpuError> {
-        self.device.poll(wgpu::PollType::wait_indefinitely()).map_err(|e| GpuError::Failed(e.to_string()))?;
+        self.wait_at_most(MAX_WAIT)
+    }
+
+    /// Waits until everything submitted is done. A GPU that exceeds `limit` has failed: from then on no call waits for it.
+    ///
+    /// # Errors
+    /// [`GpuError`] if the device failed; [`GpuError::Hung`] if it exceeds `limit`.
+    pub fn wait_at_most(&self, limit: Duration) -> Result<(), GpuError> {
+        self.check()?;
+        match self.device.poll(wgpu::PollType::Wait { submission_index: None, timeout: Some(limit) }) {
+            Ok(_) => {}
+            Err(wgpu::PollError::Timeout) => note(&self.failure, Failure::Hung(limit)),
+            Err(error) => return Err(GpuError::Failed(error.to_string())),
+        }
         self.check()
     }
 
@@ -312,9 +340,6 @@ fn check_limits(offered: &wgpu::Limits) -> Result<(), GpuError> {
 }
 
 fn watch(device: &wgpu::Device, failure: &Arc<Mutex<Option<Failure>>>) {
-    let note = |slot: &Mutex<Option<Failure>>, found: Failure| {
-        slot.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(found);
-    };
     let slot = failure.clone();
     device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| {
         let found = match error {
@@ -325,4 +350,9 @@ fn watch(device: &wgpu::Device, failure: &Arc<Mutex<Option<Failure>>>) {
     }));
     let slot = failure.clone();
     device.set_device_lost_callback(move |_, message| note(&slot, Failure::Failed(format!("device lost: {message}"))));
+}
+
+/// Keeps the first failure.
+fn note(slot: &Mutex<Option<Failure>>, found: Failure) {
+    slot.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(found);
 }

@@ -7,6 +7,7 @@ use image::{Rgb, RgbImage};
 use serde::{Deserialize, Serialize};
 
 use crate::render::Rendered;
+use crate::sequence::RectifiedImage;
 use crate::splat::Exposure;
 
 /// Whether, and how firmly, exposures are corrected.
@@ -50,11 +51,12 @@ const MIN_ALPHA: f32 = 0.95;
 const WELL_EXPOSED: std::ops::Range<f32> = 0.08..0.92;
 
 /// The exposure of an image of which the map shows `rendered`; `last` is that of the keyframe before.
-pub(super) fn measure(image: &RgbImage, rendered: &Rendered, last: &Exposure, config: &ExposureConfig) -> Exposure {
-    let covered: Vec<usize> = (0..rendered.color_depth.len()).filter(|&i| rendered.alpha(i) >= MIN_ALPHA).collect();
+pub(super) fn measure(image: &RectifiedImage, rendered: &Rendered, last: &Exposure, config: &ExposureConfig) -> Exposure {
+    let is_covered = |&i: &usize| rendered.alpha(i) >= MIN_ALPHA && image.is_valid(i);
+    let covered: Vec<usize> = (0..rendered.color_depth.len()).filter(is_covered).collect();
     let channel = |k: usize| {
         let log_ratio = |&i: &usize| {
-            let recorded = f32::from(image.as_raw()[3 * i + k]) / 255.0;
+            let recorded = f32::from(image.color.as_raw()[3 * i + k]) / 255.0;
             let shown = rendered.color_depth[i][k];
             (WELL_EXPOSED.contains(&recorded) && WELL_EXPOSED.contains(&shown)).then(|| (recorded / shown).ln())
         };
@@ -85,12 +87,14 @@ pub(super) fn corrected(image: &RgbImage, exposure: &Exposure) -> RgbImage {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::geometry::Pinhole;
 
     /// A picture of some colours, and a render of it by a map of another exposure, half of which is missing.
-    fn pair(gains: [f32; 3]) -> (RgbImage, Rendered) {
+    fn pair(gains: [f32; 3]) -> (RectifiedImage, Rendered) {
         let shown = |x: u32, y: u32, k: usize| 0.2 + 0.5 * (((x * 7 + y * 13 + k as u32 * 5) % 32) as f32 / 32.0);
-        let image =
+        let color =
             RgbImage::from_fn(32, 24, |x, y| Rgb(std::array::from_fn(|k| (shown(x, y, k) * gains[k] * 255.0).round() as u8)));
+        let pinhole = Pinhole { fx: 30.0, fy: 30.0, cx: 15.5, cy: 11.5, width: 32, height: 24 };
         let pixels = || (0..32 * 24u32).map(|i| (i % 32, i / 32));
         let rendered = Rendered {
             width: 32,
@@ -98,7 +102,7 @@ mod tests {
             color_depth: pixels().map(|(x, y)| [shown(x, y, 0), shown(x, y, 1), shown(x, y, 2), 1.0]).collect(),
             transmittance: pixels().map(|(x, _)| if x < 16 { 0.0 } else { 0.9 }).collect(),
         };
-        (image, rendered)
+        (RectifiedImage { pinhole, color, depth: None, valid: None }, rendered)
     }
 
     #[test]
@@ -108,11 +112,22 @@ mod tests {
         let config = ExposureConfig { prior_share: 1e-6, pull: 0.0, ..ExposureConfig::default() };
         let exposure = measure(&image, &rendered, &Exposure::default(), &config);
         assert!((exposure.gains() - glam::Vec3::from(gains)).abs().max_element() < 0.01, "{exposure:?}");
-        let corrected = corrected(&image, &exposure);
+        let corrected = corrected(&image.color, &exposure);
         let off = |(i, p): (usize, &Rgb<u8>)| {
             (0..3).map(|k| (f32::from(p.0[k]) - 255.0 * rendered.color_depth[i][k]).abs()).fold(0.0, f32::max)
         };
         assert!(corrected.pixels().enumerate().map(off).fold(0.0, f32::max) < 2.5);
+    }
+
+    #[test]
+    fn pixels_that_were_not_recorded_say_nothing() {
+        let (mut image, rendered) = pair([1.2; 3]);
+        let config = ExposureConfig { prior_share: 1e-6, pull: 0.0, ..ExposureConfig::default() };
+        let expected = measure(&image, &rendered, &Exposure::default(), &config);
+        image.valid = Some((0..32 * 24).map(|i| i % 32 < 12).collect());
+        (0..32 * 24).filter(|i| i % 32 >= 12).for_each(|i| image.color.put_pixel(i % 32, i / 32, Rgb([100; 3])));
+        let found = measure(&image, &rendered, &Exposure::default(), &config);
+        assert!((found.gains() - expected.gains()).abs().max_element() < 0.01, "{found:?} {expected:?}");
     }
 
     #[test]

@@ -1,6 +1,8 @@
 //! New Gaussians from a keyframe: where the render lacks alpha, lies behind the measured surface or misses detail, one per block of pixels:
 //! a quadtree of blocks, small where the colours vary and large where they don't, each Gaussian the size of its block on the surface.
 //!
+//! Pixels that the camera did not record get none.
+//!
 //! Pixels without depth get Gaussians too where the map has nothing: their depth is interpolated across the hole, from the farther side
 //! where the sides differ (a structured-light sensor is blind in the shadow beside a near object). Later views correct them.
 
@@ -35,11 +37,13 @@ pub(super) fn gaussians(
     let missed = rendered.map(|r| Missed::new(&image.color, r));
     for block in sums.blocks(config) {
         let center = ((block.x + block.size / 2).min(width - 1), (block.y + block.size / 2).min(height - 1));
-        let metres = filled[(center.1 * width + center.0) as usize];
+        let pixel = (center.1 * width + center.0) as usize;
+        let metres = filled[pixel];
         let measured = depth.at(center.0, center.1);
-        if metres >= config.min_depth_metres
+        if image.is_valid(pixel)
+            && metres >= config.min_depth_metres
             && metres <= config.max_depth_metres
-            && (rendered.is_none_or(|r| lacks(r, (center.1 * width + center.0) as usize, measured, config))
+            && (rendered.is_none_or(|r| lacks(r, pixel, measured, config))
                 || missed.as_ref().is_some_and(|m| m.response(block) > config.missed_detail))
         {
             let slope = slope(&filled, (width, height), center, block.size);
@@ -255,7 +259,7 @@ mod tests {
     fn keyframe(color: RgbImage, metres: Vec<f32>) -> Keyframe {
         let (width, height) = color.dimensions();
         let pinhole = Pinhole { fx: 30.0, fy: 30.0, cx: 15.5, cy: 11.5, width, height };
-        let image = RectifiedImage { pinhole, color, depth: Some(DepthImage { width, height, metres }) };
+        let image = RectifiedImage { pinhole, color, depth: Some(DepthImage { width, height, metres }), valid: None };
         Keyframe { id: 0, world_from_camera: Se3::identity(), image, depth_source: DepthSource::Sensor, covisible: vec![] }
     }
 

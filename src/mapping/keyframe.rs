@@ -134,7 +134,7 @@ impl Images {
     fn new(gpu: &Gpu, image: &RectifiedImage, with_half: bool) -> Result<Self, GpuError> {
         let target = |image: &RectifiedImage| {
             let depth = image.depth.as_ref().map(|d| d.metres.as_slice());
-            TargetImage::new(gpu, &image.color, depth)
+            TargetImage::masked(gpu, &image.color, depth, image.valid.as_deref())
         };
         let worth = with_half && image.pinhole.width.min(image.pinhole.height) >= MIN_HALVED;
         Ok(Self { whole: target(image)?, half: worth.then(|| target(&halved(image))).transpose()?, stored: None })
@@ -347,7 +347,12 @@ fn halved(image: &RectifiedImage) -> RectifiedImage {
         let metres = (0..pinhole.width * pinhole.height).map(mean).collect();
         DepthImage { width: pinhole.width, height: pinhole.height, metres }
     });
-    RectifiedImage { pinhole, color, depth }
+    let valid = image.valid.as_ref().map(|valid| {
+        let width = image.pinhole.width;
+        let all = |i: u32| block(i % pinhole.width, i / pinhole.width).iter().all(|(x, y)| valid[(y * width + x) as usize]);
+        (0..pinhole.width * pinhole.height).map(all).collect()
+    });
+    RectifiedImage { pinhole, color, depth, valid }
 }
 
 /// Depths within this factor of each other are on one surface.

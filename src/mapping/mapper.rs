@@ -11,7 +11,6 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use fastrand::Rng;
-use image::RgbImage;
 use serde::{Deserialize, Serialize};
 
 pub use refine::{FinalRefinement, RefineReport};
@@ -111,7 +110,7 @@ impl Mapper {
         }
         let mut keyframe = self.sweep(keyframe).map_or(Cow::Borrowed(keyframe), Cow::Owned);
         let rendered = if self.cloud.is_empty() { None } else { Some(self.render(&keyframe.camera())?) };
-        let exposure = self.exposure(&keyframe.image.color, rendered.as_ref());
+        let exposure = self.exposure(&keyframe.image, rendered.as_ref());
         if exposure != Exposure::default() {
             keyframe.to_mut().image.color = exposure::corrected(&keyframe.image.color, &exposure);
         }
@@ -235,12 +234,13 @@ impl Mapper {
             .zip(&landmarks.metres)
             .filter(|(_, metres)| **metres > 0.0)
             .for_each(|(to, metres)| *to = *metres);
+        (0..depth.metres.len()).filter(|&i| !image.is_valid(i)).for_each(|i| depth.metres[i] = 0.0);
         let image = RectifiedImage { depth: Some(depth), ..image.clone() };
         Some(Keyframe { image, ..keyframe.clone() })
     }
 
     /// The exposure of an image of which the map shows `rendered`. A map that no step has moved yet shows nothing that counts.
-    fn exposure(&self, image: &RgbImage, rendered: Option<&Rendered>) -> Exposure {
+    fn exposure(&self, image: &RectifiedImage, rendered: Option<&Rendered>) -> Exposure {
         let (config, last) = (&self.config.exposure, self.keyframes.last().map_or(Exposure::default(), |k| k.exposure));
         let shown = rendered.filter(|_| config.enabled && self.is_trained());
         shown.map_or(last, |rendered| exposure::measure(image, rendered, &last, config))

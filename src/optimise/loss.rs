@@ -86,7 +86,7 @@ impl LossTerms {
 /// A view's pixels on the host, as the GPU has them.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Pixels {
-    /// `[H * W]` 8-bit RGBA.
+    /// `[H * W]` 8-bit RGBA; A is 255, or the whole is 0 where the camera recorded nothing.
     pub color: Vec<u32>,
     /// `[H * W]` metres, 0 where not measured.
     pub depth_metres: Vec<f32>,
@@ -140,13 +140,26 @@ impl TargetImage {
     /// # Errors
     /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn new(gpu: &Gpu, image: &RgbImage, depth_metres: Option<&[f32]>) -> Result<Self, GpuError> {
+        Self::masked(gpu, image, depth_metres, None)
+    }
+
+    /// As [`Self::new`], of an image of which only the `valid` pixels `[H * W]` enter the loss.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
+    pub fn masked(gpu: &Gpu, image: &RgbImage, depth_metres: Option<&[f32]>, valid: Option<&[bool]>) -> Result<Self, GpuError> {
         let (width, height) = image.dimensions();
         let pixels = GpuPixels::blank(gpu, (width, height))?;
-        let packed: Vec<u32> = image.pixels().map(|p| u32::from_le_bytes([p.0[0], p.0[1], p.0[2], 255])).collect();
+        let mut packed: Vec<u32> = image.pixels().map(|p| u32::from_le_bytes([p.0[0], p.0[1], p.0[2], 255])).collect();
+        if let Some(valid) = valid {
+            assert_eq!(valid.len(), packed.len(), "the mask has the size of the image");
+            packed.iter_mut().zip(valid).filter(|(_, valid)| !**valid).for_each(|(pixel, _)| *pixel = 0);
+        }
         pixels.color.write(gpu, 0, &packed);
         if let Some(metres) = depth_metres {
             assert_eq!(metres.len(), packed.len(), "depth has the size of the image");
-            pixels.depth.write(gpu, 0, metres);
+            let measured: Vec<f32> = metres.iter().zip(&packed).map(|(m, color)| if *color == 0 { 0.0 } else { *m }).collect();
+            pixels.depth.write(gpu, 0, &measured);
         }
         let unknown = vec![[-1.0f32, 0.0, 0.0, 0.0]; image_buffers::tiles((width, height))];
         let tile_losses = GpuBuffer::storage(gpu, "tile losses", unknown.len() as u64 * 16)?;

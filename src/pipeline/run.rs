@@ -16,6 +16,7 @@ use super::{PipelineError, Progress};
 use crate::gpu::Gpu;
 use crate::recording::Recording;
 use crate::run_folder::{Checkpointer, Elapsed, History, RunResult};
+use crate::splat::GaussianCloud;
 
 /// Frames decoded ahead of the tracker. In real time these are due frames that wait: a slow frame, of a keyframe say, costs none of the next.
 pub(super) const FRAMES_AHEAD: usize = 8;
@@ -110,7 +111,7 @@ fn gather(
     errors.extend(track.error);
     errors.extend(map.error);
     let result = RunResult {
-        cloud: map.cloud,
+        cloud: writable(map.cloud),
         poses: track.trajectory,
         trajectory,
         keyframes: track.keyframes,
@@ -124,4 +125,38 @@ fn gather(
         resumed,
     };
     Replay { result, error: errors.into_iter().next(), stopped: false }
+}
+
+/// A map that every format can hold: Gaussians with a NaN or an infinity are left out, with a warning.
+fn writable(cloud: Arc<GaussianCloud>) -> Arc<GaussianCloud> {
+    if cloud.first_non_finite().is_none() {
+        return cloud;
+    }
+    let finite = cloud.finite();
+    tracing::warn!(
+        "{} of {} Gaussians are left out: they hold values that are not finite",
+        cloud.len() - finite.len(),
+        cloud.len()
+    );
+    Arc::new(finite)
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::{Quat, Vec3};
+
+    use super::*;
+    use crate::splat::{Gaussian, ShDegree};
+
+    #[test]
+    fn gaussians_that_are_not_finite_never_reach_a_file() {
+        let mut cloud = GaussianCloud::new(ShDegree::new(1).unwrap());
+        for (x, harmonic) in [(0.0, 0.0), (1.0, f32::NAN), (f32::INFINITY, 0.0), (3.0, 0.5)] {
+            let (mean, sh) = (Vec3::new(x, 0.0, 1.0), vec![Vec3::ZERO, Vec3::splat(harmonic)]);
+            cloud.push(Gaussian { mean, log_scale: Vec3::ZERO, rotation: Quat::IDENTITY, raw_opacity: 0.0, sh });
+        }
+        let cloud = writable(Arc::new(cloud));
+        assert_eq!(cloud.means.iter().map(|mean| mean.x).collect::<Vec<_>>(), [0.0, 3.0]);
+        assert!(Arc::ptr_eq(&cloud, &writable(cloud.clone())));
+    }
 }

@@ -1,5 +1,7 @@
 //! Frames as the mapper wants them: without lens distortion, at the mapping resolution.
 
+use std::sync::Arc;
+
 use image::{GrayImage, ImageBuffer, Pixel, Rgb, RgbImage};
 use nalgebra::Vector2;
 
@@ -18,9 +20,16 @@ pub struct RectifiedImage {
     pub color: RgbImage,
     /// Depth of the same pixels, where the sensor has it.
     pub depth: Option<DepthImage>,
+    /// `[height * width]`, row-major: whether the camera recorded the pixel. `None`: all of them.
+    pub valid: Option<Arc<[bool]>>,
 }
 
 impl RectifiedImage {
+    /// Whether the camera recorded pixel `i`, row-major.
+    pub fn is_valid(&self, i: usize) -> bool {
+        self.valid.as_ref().is_none_or(|valid| valid[i])
+    }
+
     /// Median of the measured depths, metres; `None` if nothing was measured.
     pub fn median_depth_metres(&self) -> Option<f64> {
         let measured = self.depth.iter().flat_map(|depth| depth.metres.iter().copied().filter(|z| *z > 0.0));
@@ -39,7 +48,14 @@ pub struct Rectifier {
     samples: usize,
     /// Mapping pixels per recorded pixel along x and y.
     scale: Vector2<f64>,
+    /// Pixels whose centre lies in the recorded image; `None`: all.
+    valid: Option<Arc<[bool]>>,
 }
+
+/// A point this far from where its distortion is undone again, pixels, lies beyond what the lens model describes.
+const MAX_LENS_ERROR: f64 = 1.0;
+/// Rounding, pixels.
+const ON_BORDER: f64 = 1e-6;
 
 impl Rectifier {
     /// A map from `camera`'s recorded images to a pinhole image `scale` times their size (0 < scale ≤ 1).
@@ -47,24 +63,31 @@ impl Rectifier {
         let pinhole = camera.pinhole.scaled(scale);
         // One bilinear sample per recorded pixel that a mapping pixel covers: a box filter.
         let samples = (1.0 / scale).round().max(1.0) as usize;
-        let mut sources = Vec::with_capacity(pinhole.width as usize * pinhole.height as usize * samples * samples);
+        let pixels = pinhole.width as usize * pinhole.height as usize;
+        let mut sources = Vec::with_capacity(pixels * samples * samples);
+        let mut valid = Vec::with_capacity(pixels);
+        let full = &camera.pinhole;
+        let in_full = |ideal: Vector2<f64>| {
+            let normalised = (ideal - Vector2::new(pinhole.cx, pinhole.cy)).component_div(&Vector2::new(pinhole.fx, pinhole.fy));
+            normalised.component_mul(&Vector2::new(full.fx, full.fy)) + Vector2::new(full.cx, full.cy)
+        };
         for y in 0..pinhole.height {
             for x in 0..pinhole.width {
+                let ideal = Vector2::new(f64::from(x), f64::from(y));
                 for sample in 0..samples * samples {
                     let offset = |k: usize| (k as f64 + 0.5) / samples as f64 - 0.5;
-                    let ideal = Vector2::new(f64::from(x) + offset(sample % samples), f64::from(y) + offset(sample / samples));
-                    let full = &camera.pinhole;
-                    let in_full = Vector2::new(
-                        (ideal.x - pinhole.cx) / pinhole.fx * full.fx + full.cx,
-                        (ideal.y - pinhole.cy) / pinhole.fy * full.fy + full.cy,
-                    );
-                    let source = camera.distort_pixel(&in_full);
+                    let source =
+                        camera.distort_pixel(&in_full(ideal + Vector2::new(offset(sample % samples), offset(sample / samples))));
                     sources.push([source.x as f32, source.y as f32]);
                 }
+                let centre = camera.distort_pixel(&in_full(ideal));
+                let lens_error = (camera.undistort_pixel(&centre) - in_full(ideal)).norm();
+                valid.push(full.contains(&centre, -0.5 - ON_BORDER) && lens_error < MAX_LENS_ERROR);
             }
         }
         let scale = Vector2::new(pinhole.fx / camera.pinhole.fx, pinhole.fy / camera.pinhole.fy);
-        Self { pinhole, sources, samples, scale }
+        let valid = valid.contains(&false).then(|| valid.into());
+        Self { pinhole, sources, samples, scale, valid }
     }
 
     /// The ideal pinhole of the rectified images.
@@ -72,19 +95,21 @@ impl Rectifier {
         self.pinhole
     }
 
-    /// Resamples colour (box filter over bilinear samples; the border repeats) and depth (mean over the nearest surface).
+    /// Resamples colour (box filter over bilinear samples; the border repeats) and depth (mean over the nearest surface; 0 at pixels that
+    /// are not valid).
     pub fn rectify(&self, frame: &Frame) -> RectifiedImage {
         let mut color = RgbImage::new(self.pinhole.width, self.pinhole.height);
         let group = self.samples * self.samples;
         for (pixel, sources) in color.pixels_mut().zip(self.sources.chunks_exact(group)) {
             *pixel = Rgb(box_filter(&frame.color, sources));
         }
-        let depth = frame.depth.as_ref().map(|depth| DepthImage {
-            width: self.pinhole.width,
-            height: self.pinhole.height,
-            metres: self.sources.chunks_exact(group).map(|sources| nearest_surface(depth, sources)).collect(),
+        let mut image = RectifiedImage { pinhole: self.pinhole, color, depth: None, valid: self.valid.clone() };
+        image.depth = frame.depth.as_ref().map(|depth| {
+            let at = |(i, sources): (usize, _)| if image.is_valid(i) { nearest_surface(depth, sources) } else { 0.0 };
+            let metres = self.sources.chunks_exact(group).enumerate().map(at).collect();
+            DepthImage { width: self.pinhole.width, height: self.pinhole.height, metres }
         });
-        RectifiedImage { pinhole: self.pinhole, color, depth }
+        image
     }
 
     /// The right image of a pair, whose camera is like the left one.
@@ -178,6 +203,27 @@ mod tests {
         let rectified = Rectifier::new(&camera(Distortion::default()), 0.5).rectify(&frame);
         assert_eq!(rectified.color.get_pixel(3, 0).0[0], 13);
         assert!(rectified.depth.unwrap().metres.iter().all(|m| *m == 1.0 || *m == 3.0));
+    }
+
+    /// A pincushion's corners lie outside of the recorded image, a barrel's border too where the lens model folds back.
+    #[test]
+    fn pixels_beyond_the_recorded_image_are_not_valid() {
+        let valid = |k1: f64, scale: f64| {
+            let rectifier = Rectifier::new(&camera(Distortion { k1, ..Distortion::default() }), scale);
+            let image = rectifier.rectify(&frame(|_, _| 1.0));
+            let (width, height) = image.color.dimensions();
+            let at = |x: u32, y: u32| {
+                let i = (y * width + x) as usize;
+                assert_eq!(image.is_valid(i), image.depth.as_ref().unwrap().metres[i] > 0.0);
+                image.is_valid(i)
+            };
+            [at(0, 0), at(width - 1, height - 1), at(width / 2, 0), at(width / 2, height / 2)]
+        };
+        assert_eq!(valid(0.2, 1.0), [false, false, false, true]);
+        assert_eq!(valid(0.2, 0.5), [false, false, true, true], "the first row's centres are further in");
+        assert_eq!(valid(-0.2, 0.5), [true; 4]);
+        assert_eq!(valid(-1.5, 1.0), [false, false, true, true]);
+        assert!(Rectifier::new(&camera(Distortion::default()), 0.3).valid.is_none());
     }
 
     #[test]

@@ -93,15 +93,23 @@ impl GaussianCloud {
 
     /// The index of the first Gaussian that holds a NaN or an infinity, if any.
     pub fn first_non_finite(&self) -> Option<usize> {
+        (0..self.len()).find(|&i| !self.is_finite(i))
+    }
+
+    /// Its Gaussians without those that hold a NaN or an infinity.
+    pub fn finite(&self) -> Self {
+        let mut cloud = Self::new(self.sh_degree);
+        (0..self.len()).filter(|&i| self.is_finite(i)).for_each(|i| cloud.push(self.get(i)));
+        cloud
+    }
+
+    fn is_finite(&self, i: usize) -> bool {
         let k = self.sh_degree.coefficients();
-        (0..self.len()).find(|&i| {
-            let finite = self.means[i].is_finite()
-                && self.log_scales[i].is_finite()
-                && self.rotations[i].is_finite()
-                && self.raw_opacities[i].is_finite()
-                && self.sh[i * k..(i + 1) * k].iter().all(|c| c.is_finite());
-            !finite
-        })
+        self.means[i].is_finite()
+            && self.log_scales[i].is_finite()
+            && self.rotations[i].is_finite()
+            && self.raw_opacities[i].is_finite()
+            && self.sh[i * k..(i + 1) * k].iter().all(|c| c.is_finite())
     }
 }
 

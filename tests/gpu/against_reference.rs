@@ -93,7 +93,7 @@ fn random_scenes_agree() {
     }
 }
 
-/// A target image for the loss, 8-bit like a real one.
+/// A target image for the loss, 8-bit like a real one, whose left border and some other pixels the camera did not record.
 fn target(rng: &mut Rng, pinhole: Pinhole) -> (RgbImage, Target64) {
     let (width, height) = (pinhole.width, pinhole.height);
     let color = RgbImage::from_fn(width, height, |_, _| image::Rgb([rng.u8(..), rng.u8(..), rng.u8(..)]));
@@ -104,13 +104,14 @@ fn target(rng: &mut Rng, pinhole: Pinhole) -> (RgbImage, Target64) {
         height: height as usize,
         color: color.pixels().map(|p| Vector3::from(p.0).map(|v| f64::from(v) / 255.0)).collect(),
         depth: metres.iter().map(|m| f64::from(*m)).collect(),
+        valid: (0..width * height).map(|i| i % width > 4 && i % 13 != 0).collect(),
     };
     (color, wide)
 }
 
 fn upload_target(gpu: &Gpu, image: &RgbImage, wide: &Target64) -> TargetImage {
     let metres: Vec<f32> = wide.depth.iter().map(|m| *m as f32).collect();
-    TargetImage::new(gpu, image, Some(&metres)).unwrap()
+    TargetImage::masked(gpu, image, Some(&metres), Some(&wide.valid)).unwrap()
 }
 
 #[test]

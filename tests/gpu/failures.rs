@@ -5,7 +5,7 @@ use std::time::Duration;
 use crate::common::recording::{ITERATIONS_PER_KEYFRAME, recording, scratch, skipped_without_adapter};
 use fastrand::Rng;
 use keysplat::export::MapFormat;
-use keysplat::gpu::{Gpu, GpuError};
+use keysplat::gpu::{Gpu, GpuBuffer, GpuError};
 use keysplat::mapping::MappingError;
 use keysplat::pipeline::{self, PipelineError, Progress, Replay};
 use keysplat::render::{GpuCloud, Rasterizer};
@@ -91,4 +91,21 @@ fn buffers_beyond_the_adapter_are_refused_and_nothing_is_lost() {
     assert!(refused.to_string().contains("256 MiB is needed, but the adapter binds at most 8 MiB"), "{refused}");
     (view.pinhole.width, view.pinhole.height) = (64, 48);
     assert_eq!(rasterizer.render(&map, &view, [0.0; 3]).unwrap(), before);
+}
+
+/// Work that takes longer than the limit is reported, and nothing waits for it again.
+#[test]
+fn a_gpu_that_hangs_is_reported() {
+    if skipped_without_adapter() {
+        return;
+    }
+    let gpu = Gpu::open(None).unwrap();
+    let [from, to] = ["from", "to"].map(|label| GpuBuffer::storage(&gpu, label, 64 << 20).unwrap());
+    let mut encoder = gpu.device.create_command_encoder(&Default::default());
+    (0..50).for_each(|_| encoder.copy_buffer_to_buffer(from.raw(), 0, to.raw(), 0, from.raw().size()));
+    gpu.queue.submit([encoder.finish()]);
+    let error = gpu.wait_at_most(Duration::ZERO).unwrap_err();
+    assert!(matches!(error, GpuError::Hung { .. }) && error.to_string().contains("counts as hung"), "{error}");
+    assert!(matches!(to.read::<u32>(&gpu, 0, 1), Err(GpuError::Hung { .. })));
+    gpu.device.poll(wgpu::PollType::wait_indefinitely()).unwrap();
 }

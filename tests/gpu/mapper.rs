@@ -15,7 +15,7 @@ fn keyframe(id: usize, with_depth: bool) -> Keyframe {
     let (width, height) = (PINHOLE.width, PINHOLE.height);
     let color = RgbImage::from_fn(width, height, |x, y| Rgb([(x * 4) as u8, (y * 5) as u8, ((x / 6 + y / 6) % 2 * 200) as u8]));
     let depth = with_depth.then(|| DepthImage { width, height, metres: vec![2.0; (width * height) as usize] });
-    let image = RectifiedImage { pinhole: PINHOLE, color, depth };
+    let image = RectifiedImage { pinhole: PINHOLE, color, depth, valid: None };
     let world_from_camera = Se3::translation(0.01 * id as f64, 0.0, 0.0);
     Keyframe { id, world_from_camera, image, depth_source: DepthSource::Sensor, covisible: Vec::new() }
 }

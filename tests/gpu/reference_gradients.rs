@@ -122,6 +122,7 @@ fn loss_gradient_is_a_central_difference() {
         height,
         color: (0..width * height).map(|_| Vector3::new(number(), number(), number())).collect(),
         depth: (0..width * height).map(|i| if i % 5 == 0 { 0.0 } else { 1.0 + number() }).collect(),
+        valid: (0..width * height).map(|i| i % width > 3 || i % 11 == 0).collect(),
     };
     let image = Image64 {
         color: (0..width * height).map(|_| Vector3::new(number(), number(), number())).collect(),

@@ -36,7 +36,7 @@ fn image(world_from_camera: &Se3) -> RectifiedImage {
     let color = RgbImage::from_fn(width, height, |x, y| colour(&point(x, y)));
     let depth = |i: u32| (world_from_camera.inverse() * point(i % width, i / width)).z as f32;
     let metres = (0..width * height).map(depth).collect();
-    RectifiedImage { pinhole: PINHOLE, color, depth: Some(DepthImage { width, height, metres }) }
+    RectifiedImage { pinhole: PINHOLE, color, depth: Some(DepthImage { width, height, metres }), valid: None }
 }
 
 /// A walk along the wall, world_from_camera.

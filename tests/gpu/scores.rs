@@ -35,7 +35,13 @@ fn scores_are_those_of_their_definition() {
         let wrong: Vec<bool> = errors.iter().map(|e| *e > threshold).collect();
         let clear_cut = errors.iter().all(|e| (e - threshold).abs() > 1e-4);
         let weights = LossWeights { ssim: f64::from(loss_config.ssim_weight), depth: 0.0, precise_depth: 1.0, phase: [0, 0] };
-        let target = Target64 { width: width as usize, height: height as usize, color, depth: vec![0.0; errors.len()] };
+        let target = Target64 {
+            width: width as usize,
+            height: height as usize,
+            color,
+            depth: vec![0.0; errors.len()],
+            valid: vec![true; errors.len()],
+        };
         let (total, by_image) = loss(&rendered, &target, &weights);
         let expected = scores(&view, &cloud_64, &by_image, &wrong);
 

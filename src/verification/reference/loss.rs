@@ -15,6 +15,8 @@ pub struct Target64 {
     pub color: Vec<Vector3<f64>>,
     /// `[H * W]` metres, 0 where not measured.
     pub depth: Vec<f64>,
+    /// `[H * W]` whether the camera recorded the pixel.
+    pub valid: Vec<bool>,
 }
 
 /// Weights of the loss: λ of SSIM against L1, and of the depth term per metre.
@@ -69,17 +71,20 @@ pub fn loss(image: &Image64, target: &Target64, weights: &LossWeights) -> (f64, 
     let mut gradient =
         ImageGradient64 { color: vec![Vector3::zeros(); pixels], depth: vec![0.0; pixels], alpha: vec![0.0; pixels] };
     for channel in 0..3 {
-        let x: Vec<f64> = image.color.iter().map(|c| c[channel]).collect();
-        let y: Vec<f64> = target.color.iter().map(|c| c[channel]).collect();
-        let (ssim, by_x) = mean_ssim(target.width, target.height, &x, &y, weights.phase);
+        // Pixels that were not recorded are zero in both images, as those beyond the border are.
+        let recorded = |colors: &[Vector3<f64>]| -> Vec<f64> {
+            colors.iter().zip(&target.valid).map(|(color, valid)| if *valid { color[channel] } else { 0.0 }).collect()
+        };
+        let (x, y) = (recorded(&image.color), recorded(&target.color));
+        let (ssim, by_x) = mean_ssim(target, &x, &y, weights.phase);
         value += weights.ssim * (1.0 - ssim) / 3.0;
-        for i in 0..pixels {
+        for i in (0..pixels).filter(|&i| target.valid[i]) {
             value += (1.0 - weights.ssim) * (x[i] - y[i]).abs() * per_pixel / 3.0;
             let sign = if x[i] == y[i] { 0.0 } else { (x[i] - y[i]).signum() };
             gradient.color[i][channel] = ((1.0 - weights.ssim) * sign - weights.ssim * by_x[i] * pixels as f64) * per_pixel / 3.0;
         }
     }
-    for i in (0..pixels).filter(|&i| target.depth[i] > 0.0) {
+    for i in (0..pixels).filter(|&i| target.valid[i] && target.depth[i] > 0.0) {
         let residual = image.depth[i] - (1.0 - image.transmittance[i]) * target.depth[i];
         let weight = weights.depth * (weights.precise_depth / target.depth[i]).powi(2).min(1.0) * per_pixel;
         value += weight * residual.abs();
@@ -90,8 +95,9 @@ pub fn loss(image: &Image64, target: &Target64, weights: &LossWeights) -> (f64, 
     (value, gradient)
 }
 
-/// Mean SSIM of the windows of a phase, and its gradient by `x`.
-fn mean_ssim(width: usize, height: usize, x: &[f64], y: &[f64], phase: [usize; 2]) -> (f64, Vec<f64>) {
+/// Mean SSIM of the windows of a phase, and its gradient by `x`. A window at a pixel that was not recorded is perfect.
+fn mean_ssim(target: &Target64, x: &[f64], y: &[f64], phase: [usize; 2]) -> (f64, Vec<f64>) {
+    let Target64 { width, height, .. } = *target;
     let product = |a: &[f64], b: &[f64]| -> Vec<f64> { a.iter().zip(b).map(|(a, b)| a * b).collect() };
     let filter = |values: &[f64]| blur(width, height, values);
     let (mx, my) = (filter(x), filter(y));
@@ -101,6 +107,10 @@ fn mean_ssim(width: usize, height: usize, x: &[f64], y: &[f64], phase: [usize; 2
     let mut mean = 0.0;
     let mut partials = [vec![0.0; x.len()], vec![0.0; x.len()], vec![0.0; x.len()]];
     for i in (0..x.len()).filter(is_window) {
+        if !target.valid[i] {
+            mean += per_window;
+            continue;
+        }
         let a1 = 2.0 * mx[i] * my[i] + C1;
         let a2 = 2.0 * (xy[i] - mx[i] * my[i]) + C2;
         let b1 = mx[i] * mx[i] + my[i] * my[i] + C1;
