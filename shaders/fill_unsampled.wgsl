@@ -1,10 +1,11 @@
-// Copies the recorded image into unsampled tiles: its neighbours' SSIM needs something to compare. One workgroup a tile.
+// Copies the recorded image, in the map's colours, into unsampled tiles: its neighbours' SSIM needs something to compare. One workgroup a tile.
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<uniform> unsampled: UnsampledTiles;
 @group(0) @binding(2) var<storage, read> target_color: array<u32>;
 // [H, W] see `rasterize_forward`.
 @group(0) @binding(3) var<storage, read_write> color_depth: array<vec4<f32>>;
+@group(0) @binding(4) var<uniform> setup: LossSetup;
 
 const THREADS: u32 = 32u;
 
@@ -23,7 +24,7 @@ fn main(
         let pixel = first + vec2(i % TILE_WIDTH, i / TILE_WIDTH);
         if pixel.x < view.width && pixel.y < view.height {
             let index = pixel.y * view.width + pixel.x;
-            color_depth[index] = vec4(unpack4x8unorm(target_color[index]).xyz, 0.0);
+            color_depth[index] = vec4(wanted_pixel(target_color[index]).xyz, 0.0);
         }
     }
 }

@@ -41,7 +41,7 @@ fn main(
     for (var k = 0u; k < end; k++) {
         rendered[k] = color_depth[(y + k) * setup.width + x];
         // A is 0 where nothing was recorded.
-        wanted[k] = unpack4x8unorm(target_color[(y + k) * setup.width + x]);
+        wanted[k] = wanted_pixel(target_color[(y + k) * setup.width + x]);
     }
     for (var channel = 0u; channel < 3u; channel++) {
         let stride = bordered_windows(setup.width);

@@ -73,7 +73,7 @@ fn main(
         }
         let index = (y + k) * setup.width + x;
         let rendered = color_depth[index];
-        let wanted = unpack4x8unorm(target_color[index]);
+        let wanted = wanted_pixel(target_color[index]);
         let error = wanted.w * (rendered.xyz - wanted.xyz);
         let measured = target_depth[index];
         sum.x += abs(error.x) + abs(error.y) + abs(error.z);
@@ -110,7 +110,7 @@ fn add_pixel(
 ) {
     let inside = x >= 0 && y >= 0 && x < i32(setup.width) && y < i32(setup.height);
     let index = select(0u, u32(y) * setup.width + u32(x), inside);
-    let wanted = select(vec4(0.0), unpack4x8unorm(target_color[index]), inside);
+    let wanted = select(vec4(0.0), wanted_pixel(target_color[index]), inside);
     let rendered = select(vec3(0.0), color_depth[index].xyz, wanted.w > 0.0);
     add(red, quantities(rendered.x, wanted.x), taps);
     add(green, quantities(rendered.y, wanted.y), taps);

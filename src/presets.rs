@@ -17,6 +17,8 @@ use crate::render::BlendForm;
 pub enum Preset {
     /// Keep up with the recording's own frame rate: resolution and steps follow from the adapter's speed.
     Realtime,
+    /// A third of the default's steps.
+    Draft,
     /// The defaults.
     Balanced,
     /// More epochs at the end, and denser insertion.
@@ -27,7 +29,7 @@ pub enum Preset {
 
 impl Preset {
     /// All presets, the fastest one first.
-    pub const ALL: [Self; 4] = [Self::Realtime, Self::Balanced, Self::Quality, Self::Best];
+    pub const ALL: [Self; 5] = [Self::Realtime, Self::Draft, Self::Balanced, Self::Quality, Self::Best];
 
     /// What a run uses that chooses none: more steps on faster kinds of adapter.
     pub fn for_adapter(adapter: &AdapterSummary) -> Self {
@@ -56,6 +58,13 @@ impl Preset {
                 mapping.density.after_share = 0.0;
                 // In so few steps a tile that is left out once is hardly sampled again.
                 mapping.tile_sampling.min_share = 1.0;
+            }
+            Self::Draft => {
+                // With so few steps a keyframe's own are best kept for the end.
+                mapping.first_iterations = 20;
+                mapping.iterations_per_keyframe = 3;
+                mapping.refine.growth = 0.0;
+                mapping.refine.final_epochs = 6;
             }
             Self::Balanced => {}
             Self::Quality => refined(config, 60),
@@ -163,9 +172,10 @@ mod tests {
             config
         };
         assert_eq!(of(Preset::Balanced), Config::default());
-        let epochs = [Preset::Balanced, Preset::Quality, Preset::Best].map(|preset| of(preset).mapping.refine.final_epochs);
+        let epochs =
+            [Preset::Draft, Preset::Balanced, Preset::Quality, Preset::Best].map(|preset| of(preset).mapping.refine.final_epochs);
         assert!(epochs.is_sorted_by(|fewer, more| fewer < more), "{epochs:?}");
         let live = Preset::ALL.map(|preset| (of(preset).replay.real_time, of(preset).mapping.yields_to_keyframes));
-        assert_eq!(live, [(true, true), (false, false), (false, false), (false, false)]);
+        assert_eq!(live, [(true, true), (false, false), (false, false), (false, false), (false, false)]);
     }
 }

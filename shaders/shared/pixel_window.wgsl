@@ -71,28 +71,3 @@ const WINDOW_BORDER: u32 = 3u;
 fn bordered_windows(size: u32) -> u32 {
     return (size + 15u) / 16u * 8u + 2u * WINDOW_BORDER;
 }
-
-// Weights of every part of the loss; host twin: `optimise::loss::LossSetup`.
-struct LossSetup {
-    width: u32,
-    height: u32,
-    // λ: share of SSIM.
-    ssim_weight: f32,
-    // λ_depth per metre; 0 without depth.
-    depth_weight: f32,
-    // Depth, metres, beyond which the weight falls with its square, as a sensor's precision does.
-    precise_depth: f32,
-    // Of the view's depth image, 0 to 1.
-    depth_confidence: f32,
-    // First pixel with a window, 0 or 1 along x and along y.
-    phase_x: u32,
-    phase_y: u32,
-    // Pixels of the image for each of its windows: about four.
-    pixels_per_window: f32,
-}
-
-// What a residual of depth counts, as a share of `depth_weight`.
-fn depth_precision(measured: f32) -> f32 {
-    let ratio = setup.precise_depth / measured;
-    return setup.depth_confidence * min(1.0, ratio * ratio);
-}

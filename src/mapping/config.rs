@@ -237,6 +237,8 @@ pub struct RefineConfig {
     pub density_every: usize,
     /// by the scores of so many keyframes, evenly spread over all.
     pub density_views: usize,
+    /// A view whose colour error falls by less than this share from one epoch to the next rests for some epochs; 0: none does.
+    pub min_gain: f32,
     /// Share of the steps after which the map grows no more.
     pub growth_share: f32,
     /// Share of the steps, the first ones, that see the images at half size.
@@ -274,6 +276,7 @@ impl Default for RefineConfig {
             all_tiles: true,
             density_every: 200,
             density_views: 10,
+            min_gain: 0.01,
             growth_share: 0.65,
             half_size_share: 0.0,
             final_lr_scale_position: 0.02,
@@ -301,7 +304,9 @@ impl MappingConfig {
         // No keyframe inserts anything during the refinement: what the first Gaussians miss must grow out of them.
         let mut density = DensityConfig::default();
         density.multi_view.max_growth = 0.15;
-        Self { iterations_per_keyframe: 0, first_iterations: 0, refine, adam, density, ..Self::default() }
+        // Photos arrive before there is a map to compare them with.
+        let exposure = ExposureConfig { refinements: 3, ..ExposureConfig::default() };
+        Self { iterations_per_keyframe: 0, first_iterations: 0, exposure, refine, adam, density, ..Self::default() }
     }
 
     /// A copy for a world of `units_per_metre` units to a metre: every length is converted.
@@ -375,6 +380,7 @@ impl MappingConfig {
         self.limits.validate().map_err(|e| format!("mapping.limits: {e}"))?;
         let closed_shares = [
             ("refine.growth_share", self.refine.growth_share),
+            ("refine.min_gain", self.refine.min_gain),
             ("refine.half_size_share", self.refine.half_size_share),
             ("window.final_lr_scale", self.window.final_lr_scale),
         ];

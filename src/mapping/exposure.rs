@@ -1,11 +1,13 @@
 //! A keyframe's exposure against the map's, which began as that of the first keyframe, and the image as it would be in the map's.
 //!
-//! It is measured once, when the keyframe comes, on the render that insertion needs as well: the median ratio of image and render over the
-//! pixels that both show well, in each channel. The map then learns from corrected images, and loss, insertion and scores know nothing of it.
+//! It is measured when the keyframe arrives, on the render that insertion needs as well: the median ratio of image and render over the
+//! pixels that both show well, in each channel. Photos arrive before there is a map, so the final refinement measures them. The loss
+//! compares the map with corrected images.
 
 use image::{Rgb, RgbImage};
 use serde::{Deserialize, Serialize};
 
+use crate::optimise::Pixels;
 use crate::render::Rendered;
 use crate::sequence::RectifiedImage;
 use crate::splat::Exposure;
@@ -23,11 +25,13 @@ pub struct ExposureConfig {
     pub pull: f32,
     /// Largest change of a channel's log gain from one keyframe to the next; more is taken for something else.
     pub max_change: f32,
+    /// Measurements of all keyframes' exposures during the first half of the final refinement. The map's own is then their mean.
+    pub refinements: usize,
 }
 
 impl Default for ExposureConfig {
     fn default() -> Self {
-        Self { enabled: true, prior_share: 0.1, pull: 0.3, max_change: 0.7 }
+        Self { enabled: true, prior_share: 0.1, pull: 0.3, max_change: 0.7, refinements: 0 }
     }
 }
 
@@ -50,13 +54,19 @@ const MIN_ALPHA: f32 = 0.95;
 /// Nor do those that are nearly black or nearly saturated in the image or the render.
 const WELL_EXPOSED: std::ops::Range<f32> = 0.08..0.92;
 
-/// The exposure of an image of which the map shows `rendered`; `last` is that of the keyframe before.
-pub(super) fn measure(image: &RectifiedImage, rendered: &Rendered, last: &Exposure, config: &ExposureConfig) -> Exposure {
-    let is_covered = |&i: &usize| rendered.alpha(i) >= MIN_ALPHA && image.is_valid(i);
-    let covered: Vec<usize> = (0..rendered.color_depth.len()).filter(is_covered).collect();
+/// The exposure of an image of which the map shows `rendered`; `last` is that of the keyframe before. `recorded` has the image's pixels, 0 to
+/// 255, and `None` where the camera recorded nothing.
+pub(super) fn measure(
+    recorded: impl Fn(usize) -> Option<[u8; 3]>,
+    rendered: &Rendered,
+    last: &Exposure,
+    config: &ExposureConfig,
+) -> Exposure {
+    let covered = (0..rendered.color_depth.len()).filter(|&i| rendered.alpha(i) >= MIN_ALPHA);
+    let covered: Vec<(usize, [u8; 3])> = covered.filter_map(|i| Some((i, recorded(i)?))).collect();
     let channel = |k: usize| {
-        let log_ratio = |&i: &usize| {
-            let recorded = f32::from(image.color.as_raw()[3 * i + k]) / 255.0;
+        let log_ratio = |&(i, pixel): &(usize, [u8; 3])| {
+            let recorded = f32::from(pixel[k]) / 255.0;
             let shown = rendered.color_depth[i][k];
             (WELL_EXPOSED.contains(&recorded) && WELL_EXPOSED.contains(&shown)).then(|| (recorded / shown).ln())
         };
@@ -72,6 +82,26 @@ pub(super) fn measure(image: &RectifiedImage, rendered: &Rendered, last: &Exposu
         (1.0 - config.pull) * found
     };
     Exposure([channel(0), channel(1), channel(2)])
+}
+
+/// The pixels of an image, see [`measure`].
+pub(super) fn recorded(image: &RectifiedImage) -> impl Fn(usize) -> Option<[u8; 3]> {
+    |i| image.is_valid(i).then(|| std::array::from_fn(|k| image.color.as_raw()[3 * i + k]))
+}
+
+/// The same of pixels as the GPU has them.
+pub(super) fn recorded_pixels(pixels: &Pixels) -> impl Fn(usize) -> Option<[u8; 3]> {
+    |i| {
+        let [r, g, b, a] = pixels.color[i].to_le_bytes();
+        (a > 0).then_some([r, g, b])
+    }
+}
+
+/// Makes the map's exposure the mean of these.
+pub(super) fn center(exposures: &mut [Exposure]) {
+    let count = exposures.len().max(1) as f32;
+    let mean: [f32; 3] = std::array::from_fn(|k| exposures.iter().map(|exposure| exposure.0[k]).sum::<f32>() / count);
+    exposures.iter_mut().for_each(|exposure| (0..3).for_each(|k| exposure.0[k] -= mean[k]));
 }
 
 /// The image as the map's exposure would have it.
@@ -110,7 +140,7 @@ mod tests {
         let gains = [1.2, 1.0, 0.85];
         let (image, rendered) = pair(gains);
         let config = ExposureConfig { prior_share: 1e-6, pull: 0.0, ..ExposureConfig::default() };
-        let exposure = measure(&image, &rendered, &Exposure::default(), &config);
+        let exposure = measure(recorded(&image), &rendered, &Exposure::default(), &config);
         assert!((exposure.gains() - glam::Vec3::from(gains)).abs().max_element() < 0.01, "{exposure:?}");
         let corrected = corrected(&image.color, &exposure);
         let off = |(i, p): (usize, &Rgb<u8>)| {
@@ -123,10 +153,10 @@ mod tests {
     fn pixels_that_were_not_recorded_say_nothing() {
         let (mut image, rendered) = pair([1.2; 3]);
         let config = ExposureConfig { prior_share: 1e-6, pull: 0.0, ..ExposureConfig::default() };
-        let expected = measure(&image, &rendered, &Exposure::default(), &config);
+        let expected = measure(recorded(&image), &rendered, &Exposure::default(), &config);
         image.valid = Some((0..32 * 24).map(|i| i % 32 < 12).collect());
         (0..32 * 24).filter(|i| i % 32 >= 12).for_each(|i| image.color.put_pixel(i % 32, i / 32, Rgb([100; 3])));
-        let found = measure(&image, &rendered, &Exposure::default(), &config);
+        let found = measure(recorded(&image), &rendered, &Exposure::default(), &config);
         assert!((found.gains() - expected.gains()).abs().max_element() < 0.01, "{found:?} {expected:?}");
     }
 
@@ -135,14 +165,36 @@ mod tests {
         let (image, mut rendered) = pair([1.2; 3]);
         let config = ExposureConfig { pull: 0.0, ..ExposureConfig::default() };
         let last = Exposure([0.1; 3]);
-        let whole = measure(&image, &rendered, &last, &config);
+        let whole = measure(recorded(&image), &rendered, &last, &config);
         let only = |i: usize| i.is_multiple_of(32);
         (0..rendered.transmittance.len()).filter(|&i| !only(i)).for_each(|i| rendered.transmittance[i] = 1.0);
-        let little = measure(&image, &rendered, &last, &config);
+        let little = measure(recorded(&image), &rendered, &last, &config);
         assert!((0..3).all(|k| last.0[k] < little.0[k] && little.0[k] < whole.0[k]), "{little:?} {whole:?}");
         rendered.transmittance.fill(1.0);
-        assert_eq!(measure(&image, &rendered, &last, &config), last);
+        assert_eq!(measure(recorded(&image), &rendered, &last, &config), last);
         let (dark, rendered) = pair([0.45; 3]);
-        assert_eq!(measure(&dark, &rendered, &last, &config), last);
+        assert_eq!(measure(recorded(&dark), &rendered, &last, &config), last);
+    }
+
+    #[test]
+    fn the_maps_exposure_is_the_mean() {
+        let mut exposures = [Exposure([0.1, 0.2, 0.0]), Exposure([0.3, -0.2, 0.0])];
+        center(&mut exposures);
+        let expected = [[-0.1, 0.2, 0.0], [0.1, -0.2, 0.0]];
+        assert!(exposures.iter().zip(expected).all(|(e, x)| (0..3).all(|k| (e.0[k] - x[k]).abs() < 1e-6)), "{exposures:?}");
+    }
+
+    #[test]
+    fn pixels_of_the_gpu_are_those_of_the_image() {
+        let (mut image, _) = pair([1.0; 3]);
+        image.valid = Some((0..32 * 24).map(|i| i != 5).collect());
+        let alpha = |i: u32| if i == 5 { 0 } else { 255 };
+        let pack = |i: u32| {
+            let [r, g, b] = image.color.get_pixel(i % 32, i / 32).0;
+            if alpha(i) == 0 { 0 } else { u32::from_le_bytes([r, g, b, 255]) }
+        };
+        let pixels = Pixels { color: (0..32 * 24).map(pack).collect(), depth_metres: Vec::new() };
+        assert!((0..32 * 24).all(|i| recorded(&image)(i) == recorded_pixels(&pixels)(i)));
+        assert_eq!(recorded(&image)(5), None);
     }
 }

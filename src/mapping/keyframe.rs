@@ -5,7 +5,6 @@ use std::borrow::Cow;
 use image::{GrayImage, Rgb, RgbImage};
 use serde::{Deserialize, Serialize};
 
-use super::exposure;
 use super::gaussian_stats;
 use super::image_store::{ImageStore, StoredImage};
 use super::plane_sweep::{self, SourceView};
@@ -73,7 +72,7 @@ pub(super) struct MappedKeyframe {
     /// camera_from_world at which its Gaussians were inserted, or to which they were last moved.
     anchored_from_world: Se3,
     pub refinement: PoseRefinement,
-    /// Exposure of the recorded image against the map; the kept image is corrected by it.
+    /// Exposure of the recorded image against the map.
     pub exposure: Exposure,
     /// Median of the measured depths, metres; 1 if there are none.
     pub depth_metres: f64,
@@ -153,7 +152,7 @@ impl Images {
 }
 
 impl MappedKeyframe {
-    /// Uploads the images, see [`Images::new`], whose colours are corrected already.
+    /// Uploads the images, see [`Images::new`], as they were recorded.
     pub fn new(gpu: &Gpu, keyframe: &Keyframe, exposure: Exposure, with_half: bool) -> Result<Self, GpuError> {
         let (image, camera) = (&keyframe.image, keyframe.camera());
         Ok(Self {
@@ -207,9 +206,6 @@ impl MappedKeyframe {
                 return Ok(None);
             }
             image.to_mut().depth = Some(DepthImage { width, height, metres: metres.clone() });
-        }
-        if state.exposure != Exposure::default() {
-            image.to_mut().color = exposure::corrected(&image.color, &state.exposure);
         }
         let image = &*image;
         let images = Images::new(gpu, image, with_half)?;
@@ -284,6 +280,17 @@ impl MappedKeyframe {
         image.map(|image| store.get(image)).transpose()
     }
 
+    /// Pixels of the whole image as they were recorded.
+    ///
+    /// # Errors
+    /// If the device fails or the store cannot be read.
+    pub fn pixels(&self, gpu: &Gpu, store: &ImageStore) -> Result<Pixels, MappingError> {
+        match self.streamed(false, store)? {
+            Some(pixels) => Ok(pixels.into_owned()),
+            None => Ok(self.image.whole.read_pixels(gpu)?.expect("an image is on the GPU or in the store")),
+        }
+    }
+
     /// Whether its depth, if any, was estimated and not measured.
     pub fn depth_is_estimated(&self) -> bool {
         self.gray.is_some()
@@ -307,10 +314,10 @@ impl MappedKeyframe {
     /// Training view; the smaller image if `coarse` and there is one. An offloaded image is still to be streamed.
     pub fn view(&self, coarse: bool) -> TrainingView<'_> {
         match self.image.half.as_ref().filter(|_| coarse) {
-            None => TrainingView::new(self.camera, &self.image.whole),
+            None => TrainingView { exposure: self.exposure, ..TrainingView::new(self.camera, &self.image.whole) },
             Some(target) => {
-                let pinhole = halved_pinhole(&self.camera.pinhole);
-                TrainingView::new(ViewCamera { pinhole, ..self.camera }, target)
+                let camera = ViewCamera { pinhole: halved_pinhole(&self.camera.pinhole), ..self.camera };
+                TrainingView { exposure: self.exposure, ..TrainingView::new(camera, target) }
             }
         }
     }

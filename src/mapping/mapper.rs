@@ -23,7 +23,8 @@ use super::plane_sweep::{self, SourceView};
 use super::refine_poses::RefinedPair;
 use super::schedule::{self, Session, Step};
 use super::{
-    Keyframe, KeyframeId, LimitsConfig, MappingConfig, MappingError, exposure, initialise_from_points, insertion, limits,
+    ExposureConfig, Keyframe, KeyframeId, LimitsConfig, MappingConfig, MappingError, exposure, initialise_from_points, insertion,
+    limits,
 };
 use crate::geometry::Se3;
 use crate::gpu::Gpu;
@@ -109,14 +110,15 @@ impl Mapper {
             return Ok(KeyframeReport { id: keyframe.id, ..KeyframeReport::default() });
         }
         let mut keyframe = self.sweep(keyframe).map_or(Cow::Borrowed(keyframe), Cow::Owned);
-        let rendered = if self.cloud.is_empty() { None } else { Some(self.render(&keyframe.camera())?) };
+        let is_compared = keyframe.image.depth.is_some() || (self.config.exposure.enabled && self.is_trained());
+        let rendered = if is_compared && !self.cloud.is_empty() { Some(self.render(&keyframe.camera())?) } else { None };
         let exposure = self.exposure(&keyframe.image, rendered.as_ref());
-        if exposure != Exposure::default() {
-            keyframe.to_mut().image.color = exposure::corrected(&keyframe.image.color, &exposure);
-        }
         // Before its insertion: a bound on memory leaves to it what the image has left.
         let mapped = MappedKeyframe::new(&self.gpu, &keyframe, exposure, self.config.learns_at_half_size())?;
         self.keyframes.push(mapped);
+        if exposure != Exposure::default() {
+            keyframe.to_mut().image.color = exposure::corrected(&keyframe.image.color, &exposure);
+        }
         self.limit_gpu_images()?;
         let inserted = self.insert_gaussians(&keyframe, rendered.as_ref())?;
         let first = self.keyframes.len() == 1;
@@ -243,7 +245,28 @@ impl Mapper {
     fn exposure(&self, image: &RectifiedImage, rendered: Option<&Rendered>) -> Exposure {
         let (config, last) = (&self.config.exposure, self.keyframes.last().map_or(Exposure::default(), |k| k.exposure));
         let shown = rendered.filter(|_| config.enabled && self.is_trained());
-        shown.map_or(last, |rendered| exposure::measure(image, rendered, &last, config))
+        shown.map_or(last, |rendered| exposure::measure(exposure::recorded(image), rendered, &last, config))
+    }
+
+    /// Measures all keyframes' exposures against the map, whose own becomes their mean.
+    fn measure_exposures(&mut self) -> Result<(), MappingError> {
+        // The mean holds the map's exposure, so that nothing has to be given up.
+        let config = ExposureConfig { pull: 0.0, ..self.config.exposure.clone() };
+        let mut measured = Vec::with_capacity(self.keyframes.len());
+        for k in 0..self.keyframes.len() {
+            let rendered = self.render(&self.keyframes[k].camera.clone())?;
+            let keyframe = &self.keyframes[k];
+            let pixels = keyframe.pixels(&self.gpu, &self.images)?;
+            measured.push(exposure::measure(exposure::recorded_pixels(&pixels), &rendered, &keyframe.exposure, &config));
+        }
+        exposure::center(&mut measured);
+        self.keyframes.iter_mut().zip(measured).for_each(|(keyframe, exposure)| keyframe.exposure = exposure);
+        Ok(())
+    }
+
+    /// Exposures of the keyframes against the map's, in the order of their arrival.
+    pub fn exposures(&self) -> impl Iterator<Item = (KeyframeId, Exposure)> {
+        self.keyframes.iter().map(|keyframe| (keyframe.id, keyframe.exposure))
     }
 
     fn insert_gaussians(&mut self, keyframe: &Keyframe, rendered: Option<&Rendered>) -> Result<usize, MappingError> {

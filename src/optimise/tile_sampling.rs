@@ -59,9 +59,15 @@ impl TileSampler {
     }
 
     /// Copies the recorded image into unsampled tiles, before the loss.
-    pub fn encode_fill(&self, pass: &mut wgpu::ComputePass<'_>, rasterizer: &Rasterizer, images: &ImageBuffers) {
+    pub fn encode_fill(
+        &self,
+        pass: &mut wgpu::ComputePass<'_>,
+        rasterizer: &Rasterizer,
+        images: &ImageBuffers,
+        loss_setup: &GpuBuffer,
+    ) {
         let (gpu, ws, target) = (rasterizer.gpu(), &rasterizer.workspace, &images.target);
-        let bindings = [(0, rasterizer.view()), (1, &ws.unsampled), (2, &target.color), (3, &ws.color_depth)];
+        let bindings = [(0, rasterizer.view()), (1, &ws.unsampled), (2, &target.color), (3, &ws.color_depth), (4, loss_setup)];
         let tiles = image_buffers::tiles(images.size) as u32;
         self.fill.dispatch(gpu, pass, &bindings, workgroups(tiles));
     }

@@ -18,7 +18,7 @@ use super::{AdamConfig, LossConfig, LossTerms, Pixels, TargetImage};
 use crate::gpu::{Gpu, GpuBuffer, GpuError};
 use crate::render::layout::{AdamSetup, COUNTERS, Counter, LossSetup, View};
 use crate::render::{BlendForm, GpuCloud, Rasterizer, Rendered, ViewCounts, cloud_from_planes};
-use crate::splat::{GaussianCloud, ViewCamera};
+use crate::splat::{Exposure, GaussianCloud, ViewCamera};
 
 /// What a step did.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -46,14 +46,17 @@ pub struct TrainingView<'a> {
     pub lr_scale: f32,
     /// Factor on the weight of the target's depth in the loss: 1 if a sensor measured it.
     pub depth_confidence: f32,
+    /// Exposure of the target against the map's.
+    pub exposure: Exposure,
     /// Tiles that the step samples; `None`: all. A scored step uses all.
     pub tile_sampling: Option<TileSampling>,
 }
 
 impl<'a> TrainingView<'a> {
-    /// The whole view at full learning rates, not scored.
+    /// The whole view at full learning rates and in the map's exposure, not scored.
     pub fn new(camera: ViewCamera, target: &'a TargetImage) -> Self {
-        Self { camera, target, streamed: None, scored: None, lr_scale: 1.0, depth_confidence: 1.0, tile_sampling: None }
+        let exposure = Exposure::default();
+        Self { camera, target, streamed: None, scored: None, lr_scale: 1.0, depth_confidence: 1.0, exposure, tile_sampling: None }
     }
 }
 
@@ -88,14 +91,8 @@ pub struct ImageGradients {
 
 /// Where the backward pass starts from.
 enum Objective<'a> {
-    /// With an offloaded target's pixels, the confidence in its depth, the scores to compute, and the tile sampling with its seed.
-    Image {
-        target: &'a TargetImage,
-        streamed: Option<&'a Pixels>,
-        loss: (&'a LossConfig, f32),
-        scored: Option<&'a ErrorPixels>,
-        tile_sampling: Option<(TileSampling, u32)>,
-    },
+    /// The loss of a view against its target.
+    Image { view: TrainingView<'a>, loss: &'a LossConfig },
     /// Gradients by the image are in the buffer already.
     Given,
 }
@@ -185,10 +182,9 @@ impl Trainer {
         let mut pending: Vec<usize> = (0..views.len()).collect();
         while !pending.is_empty() {
             for (entry, &i) in pending.iter().enumerate() {
-                let TrainingView { camera, target, streamed, scored, lr_scale, depth_confidence, tile_sampling } = &views[i];
-                let tile_sampling = tile_sampling.filter(|_| scored.is_none()).map(|sampling| (sampling, self.steps as u32));
-                let (streamed, loss) = (*streamed, (loss, *depth_confidence));
-                let objective = Objective::Image { target, streamed, loss, scored: scored.as_ref(), tile_sampling };
+                let TrainingView { camera, scored, lr_scale, tile_sampling, .. } = &views[i];
+                let view = TrainingView { tile_sampling: tile_sampling.filter(|_| scored.is_none()), ..views[i] };
+                let objective = Objective::Image { view, loss };
                 let started = Instant::now();
                 self.adam.write(&gpu, 0, &[adam.setup(self.steps, *lr_scale)]);
                 let mut encoder = gpu.device.create_command_encoder(&Default::default());
@@ -268,7 +264,7 @@ impl Trainer {
         loss: &LossConfig,
     ) -> Result<Gradients, GpuError> {
         let gpu = self.rasterizer.gpu().clone();
-        let objective = Objective::Image { target, streamed: None, loss: (loss, 1.0), scored: None, tile_sampling: None };
+        let objective = Objective::Image { view: TrainingView::new(*camera, target), loss };
         let mut gradients = self.collect(cloud, camera, [0.0; 3], &objective)?;
         gradients.loss = self.read_loss(&gpu, target)?;
         Ok(gradients)
@@ -343,7 +339,7 @@ impl Trainer {
         let prepared = self.rasterizer.prepare(cloud, viewpoint.camera, viewpoint.background)?;
         self.reserve(&gpu, &prepared.view, cloud)?;
         self.rasterizer.encode_clear(encoder);
-        if let Objective::Image { target, streamed, .. } = objective {
+        if let Objective::Image { view: TrainingView { target, streamed, .. }, .. } = objective {
             match (&target.pixels, streamed) {
                 (Some(pixels), _) => self.images[0].target.encode_copy(encoder, pixels),
                 (None, streamed) => self.images[0].target.write(&gpu, streamed.expect("a view brings an offloaded target along")),
@@ -354,21 +350,23 @@ impl Trainer {
             encoder.clear_buffer(buffer.raw(), 0, None);
         }
         let mut pass = encoder.begin_compute_pass(&Default::default());
-        if let Objective::Image { loss: (loss, _), tile_sampling: Some((sampling, seed)), .. } = objective {
-            self.sampler.encode_sample(&mut pass, &self.rasterizer, &self.images[0], loss, sampling, *seed);
+        if let Objective::Image { view: TrainingView { tile_sampling: Some(sampling), .. }, loss } = objective {
+            self.sampler.encode_sample(&mut pass, &self.rasterizer, &self.images[0], loss, sampling, self.steps as u32);
         }
         self.rasterizer.encode_forward(&mut pass, cloud.parameters(), &prepared);
-        if let Objective::Image { loss, scored, tile_sampling, .. } = objective {
-            tile_sampling.iter().for_each(|_| self.sampler.encode_fill(&mut pass, &self.rasterizer, &self.images[0]));
-            self.encode_loss(&mut pass, loss.0, loss.1);
-            let image = ScoredImage { gradients: &self.images[0].gradients, loss_total: &self.loss_total, loss: loss.0 };
-            scored.iter().for_each(|pixels| self.scores.encode(&mut pass, &self.rasterizer, &prepared, &image, pixels));
+        if let Objective::Image { view, loss } = objective {
+            if view.tile_sampling.is_some() {
+                self.sampler.encode_fill(&mut pass, &self.rasterizer, &self.images[0], &self.loss_setup);
+            }
+            self.encode_loss(&mut pass, loss, view);
+            let image = ScoredImage { gradients: &self.images[0].gradients, loss_total: &self.loss_total, loss };
+            view.scored.iter().for_each(|pixels| self.scores.encode(&mut pass, &self.rasterizer, &prepared, &image, pixels));
         }
         self.encode_backward(&mut pass, cloud, &prepared, sink);
         gpu.mark(&mut pass, Self::END_MARK);
         drop(pass);
-        if let Objective::Image { target, .. } = objective {
-            copy(encoder, &self.images[0].loss_sums, &target.tile_losses);
+        if let Objective::Image { view, .. } = objective {
+            copy(encoder, &self.images[0].loss_sums, &view.target.tile_losses);
         }
         Ok(())
     }

@@ -1,7 +1,7 @@
 //! The mapping thread: maps keyframes as they arrive, refines the map after the last one, and publishes a snapshot after each.
 
 use std::cell::RefCell;
-use std::collections::VecDeque;
+use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -12,10 +12,12 @@ use super::progress::guarded;
 use super::{PipelineError, Progress};
 use crate::evaluation::machine;
 use crate::gpu::Gpu;
-use crate::mapping::{FinalRefinement, KeyframeReport, Mapper, MapperMessage, MappingConfig, MappingError, RefinedPair};
+use crate::mapping::{
+    FinalRefinement, KeyframeId, KeyframeReport, Mapper, MapperMessage, MappingConfig, MappingError, RefinedPair,
+};
 use crate::run_folder::{CheckpointError, Checkpointer, KeyframeRecord, RunState};
 use crate::sequence::Frame;
-use crate::splat::{GaussianCloud, MapSnapshot};
+use crate::splat::{Exposure, GaussianCloud, MapSnapshot};
 
 /// Real time: the mapper pauses between two batches of steps while more frames than this wait for the tracker,
 const MOST_WAITING: usize = 2;
@@ -202,6 +204,11 @@ impl MapThread<'_> {
         let mut refinement = begun.unwrap_or(first);
         while let Some(report) = mapper.refine(&mut refinement, &|| self.progress.stopped())? {
             tracing::debug!(?report, "refined");
+            let exposures: BTreeMap<KeyframeId, Exposure> = mapper.exposures().collect();
+            let exposed = |record: &mut KeyframeRecord| {
+                exposures.get(&record.report.id).into_iter().for_each(|exposure| record.report.exposure = *exposure);
+            };
+            summary.keyframes.iter_mut().for_each(exposed);
             summary.publish(Some(Arc::new(mapper.download()?)), report.psnr_db, self.progress);
             on_round(Round { cloud: &summary.cloud, steps: mapper.step_times().len() });
             if !self.progress.stopped() {

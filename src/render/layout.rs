@@ -298,6 +298,12 @@ host_twins! {
         phase_y: u32,
         /// Pixels of the image for each of its windows.
         pixels_per_window: f32,
+        /// Factor from the recorded red to the map's.
+        red_gain: f32,
+        /// Factor from the recorded green to the map's.
+        green_gain: f32,
+        /// Factor from the recorded blue to the map's.
+        blue_gain: f32,
     }
     /// High-error mask (`shaders/rasterize_scores.wgsl`).
     ScoreSetup {

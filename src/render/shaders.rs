@@ -27,6 +27,7 @@ const TILE: &str = include_str!("../../shaders/shared/tile.wgsl");
 const TILE_BACKWARD: &str = include_str!("../../shaders/shared/tile_backward.wgsl");
 const SAMPLED_TILES: &str = include_str!("../../shaders/shared/sampled_tiles.wgsl");
 const PIXEL_WINDOW: &str = include_str!("../../shaders/shared/pixel_window.wgsl");
+const TARGET: &str = include_str!("../../shaders/shared/target.wgsl");
 const SINK_GRADIENT: &str = include_str!("../../shaders/shared/sink_gradient.wgsl");
 const SINK_ADAM: &str = include_str!("../../shaders/shared/sink_adam.wgsl");
 
@@ -52,9 +53,9 @@ shaders! {
     ORDER_TILES = "order_tiles", "order_tiles", [VIEW], ["main"];
     RASTERIZE_FORWARD = "rasterize_forward", "rasterize_forward", [VIEW, TILE], ["main"];
     SAMPLE_TILES = "sample_tiles", "sample_tiles", [VIEW], ["main"];
-    FILL_UNSAMPLED = "fill_unsampled", "fill_unsampled", [VIEW, SAMPLED_TILES], ["main"];
-    LOSS_FORWARD = "loss_forward", "loss_forward", [PIXEL_WINDOW, SAMPLED_TILES], ["main"];
-    LOSS_BACKWARD = "loss_backward", "loss_backward", [PIXEL_WINDOW, SAMPLED_TILES], ["main"];
+    FILL_UNSAMPLED = "fill_unsampled", "fill_unsampled", [VIEW, SAMPLED_TILES, TARGET], ["main"];
+    LOSS_FORWARD = "loss_forward", "loss_forward", [PIXEL_WINDOW, TARGET, SAMPLED_TILES], ["main"];
+    LOSS_BACKWARD = "loss_backward", "loss_backward", [PIXEL_WINDOW, TARGET, SAMPLED_TILES], ["main"];
     LOSS_REDUCE = "loss_reduce", "loss_reduce", [], ["main"];
     RASTERIZE_BACKWARD_NARROW = "rasterize_backward_narrow", "rasterize_backward_narrow", [VIEW, TILE, TILE_BACKWARD], ["main"];
     RASTERIZE_BACKWARD_WIDE = "rasterize_backward_wide", "rasterize_backward_wide", [VIEW, TILE, TILE_BACKWARD], ["main"];

@@ -6,10 +6,9 @@ use fastrand::Rng;
 use image::RgbImage;
 use keysplat::geometry::Pinhole;
 use keysplat::gpu::Gpu;
-use keysplat::optimise::{AdamConfig, ImageGradients, LossConfig, TargetImage, Trainer, TrainingView, ssim_phase};
+use keysplat::optimise::{AdamConfig, ImageGradients, LossConfig, TargetImage, TileSampling, Trainer, TrainingView, ssim_phase};
 use keysplat::render::{BlendForm, GpuCloud, Rasterizer};
-use keysplat::splat::ViewCamera;
-use keysplat::splat::{GaussianCloud, ShDegree};
+use keysplat::splat::{Exposure, GaussianCloud, ShDegree, ViewCamera};
 use keysplat::verification::reference::adam::{Adam64, Decay64};
 use keysplat::verification::reference::loss::{LossWeights, Target64, loss};
 use keysplat::verification::reference::project_backward::backward;
@@ -281,6 +280,40 @@ fn depth_that_is_trusted_by_a_quarter_counts_as_if_it_had_a_quarter_of_the_weigh
     // A power of two: to the bit.
     assert_eq!(trusted, weighted);
     assert_ne!(trusted.0, whole.0, "the weight does nothing here");
+}
+
+/// Of a colour and its double, where half the exposure has both in 8 bits; what is brighter than white counts as white.
+#[test]
+fn an_exposed_target_counts_as_the_one_in_the_maps_exposure() {
+    let Some(gpu) = adapter() else { return };
+    let mut rng = Rng::with_seed(10);
+    let camera = crate::common::camera(&mut rng, 64, 48);
+    let cloud = crate::common::scene(&mut rng, 200, ShDegree::default());
+    let (image, wide) = target(&mut rng, camera.pinhole);
+    let of = |change: &dyn Fn(u8) -> u8| {
+        let mut changed = image.clone();
+        changed.pixels_mut().for_each(|p| p.0 = p.0.map(change));
+        upload_target(&gpu, &changed, &wide)
+    };
+    // A target of its own each time: it remembers the losses of its tiles.
+    let learn = |change: &dyn Fn(u8) -> u8, gain: f32, tile_sampling: Option<TileSampling>| {
+        let target = of(change);
+        let mut trainer = Trainer::new(gpu.clone()).unwrap();
+        let on_gpu = upload(&gpu, &cloud);
+        let exposure = Exposure([gain.ln(); 3]);
+        let views = [TrainingView { exposure, tile_sampling, ..TrainingView::new(camera, &target) }; 3];
+        let loss = LossConfig::default();
+        let reports = trainer.steps(&on_gpu, &views, &loss, &AdamConfig::default()).unwrap();
+        f64::from(reports[2].loss.total(&loss))
+    };
+    for sampling in [None, Some(TileSampling { share: 0.5, min_share: 0.1, noise: 0.0 })] {
+        let (expected, other) = (learn(&|v| v / 2, 1.0, sampling), learn(&|v| v / 2, 1.3, sampling));
+        let double = learn(&|v| v / 2 * 2, 2.0, sampling);
+        assert!((double - expected).abs() < 1e-3 * expected, "{double} is not {expected}");
+        assert!((other - expected).abs() > 1e-2 * expected, "the exposure does nothing here");
+        let (white, beyond) = (learn(&|_| 255, 1.0, sampling), learn(&|_| 200, 0.5, sampling));
+        assert!((white - beyond).abs() < 1e-6 * white, "{white} is not {beyond}");
+    }
 }
 
 #[test]

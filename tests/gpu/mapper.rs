@@ -8,6 +8,7 @@ use keysplat::geometry::{Pinhole, Se3};
 use keysplat::gpu::Gpu;
 use keysplat::mapping::{DepthSource, Keyframe, KeyframeReport, Mapper, MapperState, MappingConfig};
 use keysplat::sequence::{DepthImage, RectifiedImage};
+use keysplat::splat::Exposure;
 
 const PINHOLE: Pinhole = Pinhole { fx: 60.0, fy: 60.0, cx: 31.5, cy: 23.5, width: 64, height: 48 };
 
@@ -152,11 +153,53 @@ fn a_refinement_of_so_many_seconds_ends_by_the_clock() {
     }
 }
 
+/// Without learning rates no view gains. Each is seen in epochs 0, 1, 3, 6 and 11 of twelve.
+#[test]
+fn views_on_their_plateau_rest() {
+    let Some(gpu) = adapter() else { return };
+    let mut config = MappingConfig { first_iterations: 5, iterations_per_keyframe: 5, ..Default::default() };
+    config.adam = config.adam.scaled(0.0, 0.0);
+    config.refine.final_epochs = 12;
+    let mut mapper = Mapper::new(gpu, &config).unwrap();
+    for id in 0..6 {
+        mapper.insert(&keyframe(id, true), &|| false).unwrap();
+    }
+    let before = mapper.step_times().len();
+    let mut refinement = mapper.begin_refinement().unwrap();
+    while mapper.refine(&mut refinement, &|| false).unwrap().is_some() {}
+    assert_eq!(mapper.step_times().len() - before, 6 * 5);
+}
+
+/// Photos of one wall, every second one twice as bright.
+#[test]
+fn exposures_of_photos_are_measured_in_the_refinement() {
+    let Some(gpu) = adapter() else { return };
+    let mut config = MappingConfig { iterations_per_keyframe: 0, first_iterations: 0, ..MappingConfig::default() };
+    (config.refine.steps, config.refine.density_every, config.exposure.refinements) = (240, 40, 3);
+    let photo = |id: usize| {
+        let mut photo = keyframe(id, true);
+        let factor = if id.is_multiple_of(2) { 4 } else { 2 };
+        photo.image.color.pixels_mut().for_each(|p| p.0 = p.0.map(|value| 20 + value / 6 * factor));
+        photo
+    };
+    let mut mapper = Mapper::new(gpu, &config).unwrap();
+    for id in 0..6 {
+        mapper.insert(&photo(id), &|| false).unwrap();
+    }
+    assert!(mapper.exposures().all(|(_, exposure)| exposure == Exposure::default()), "there is no map to compare with");
+    let mut refinement = mapper.begin_refinement().unwrap();
+    while mapper.refine(&mut refinement, &|| false).unwrap().is_some() {}
+    let gains: Vec<f32> = mapper.exposures().map(|(_, exposure)| exposure.0[1]).collect();
+    assert!(gains.iter().sum::<f32>().abs() < 1e-3, "the map's exposure is their mean: {gains:?}");
+    let apart = gains[0] - gains[1];
+    assert!((0.3..0.7).contains(&apart) && (0..6).all(|k| (gains[k] > 0.0) == k.is_multiple_of(2)), "{gains:?}");
+}
+
 #[test]
 fn the_final_epochs_draw_each_keyframe_as_often() {
     let Some(gpu) = adapter() else { return };
     let mut config = MappingConfig { first_iterations: 5, iterations_per_keyframe: 5, ..Default::default() };
-    config.refine.final_epochs = 3;
+    (config.refine.final_epochs, config.refine.min_gain) = (3, 0.0);
     for (least, expected) in [(0, 18), (11, 18), (25, 25)] {
         config.refine.steps = least;
         let mut mapper = Mapper::new(gpu.clone(), &config).unwrap();

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use clap::Args;
-use keysplat::evaluation::metrics::ImageFigures;
+use keysplat::evaluation::metrics::{ImageFigures, ImageProtocols};
 use keysplat::evaluation::views::{ViewSelection, ViewSource, evaluate_views};
 use keysplat::pipeline::{MappedLog, TrackedLog};
 use keysplat::{Config, Gpu, Progress, Recording};
@@ -49,12 +49,14 @@ struct Row {
     steps: usize,
     gaussians: usize,
     held_out: Option<ImageFigures>,
+    held_out_map_colors: Option<ImageFigures>,
 }
 
 impl Row {
-    fn new(variant: &Variant, final_epochs: usize, mapped: &MappedLog, held_out: Option<ImageFigures>) -> Self {
+    fn new(variant: &Variant, final_epochs: usize, mapped: &MappedLog, images: &ImageProtocols) -> Self {
         let (mapping_s, steps, gaussians) = (mapped.wall_s, mapped.steps, mapped.cloud.len());
-        Self { variant: variant.name.clone(), final_epochs, mapping_s, steps, gaussians, held_out }
+        let (held_out, held_out_map_colors) = (images.held_out, images.held_out_map_colors);
+        Self { variant: variant.name.clone(), final_epochs, mapping_s, steps, gaussians, held_out, held_out_map_colors }
     }
 }
 
@@ -68,8 +70,8 @@ pub(super) fn ablation(args: &AblationArgs) -> miette::Result<()> {
         variants.iter().map(|v| base.with_settings(&v.settings)).collect::<Result<_, _>>().into_diagnostic()?;
     std::fs::create_dir_all(&args.run.out).into_diagnostic()?;
     let log = TrackedLog::record(&recording, &Progress::default()).into_diagnostic()?;
-    println!("| variant | final epochs | mapping s | steps | Gaussians | held-out PSNR dB | SSIM | depth L1 cm |");
-    println!("|---|---|---|---|---|---|---|---|");
+    println!("| variant | final epochs | mapping s | steps | Gaussians | PSNR exposure dB | PSNR own dB | SSIM | depth L1 cm |");
+    println!("|---|---|---|---|---|---|---|---|---|");
     let mut rows = Vec::new();
     for (variant, config) in variants.iter().zip(configs) {
         let own = [config.mapping.refine.final_epochs];
@@ -78,7 +80,7 @@ pub(super) fn ablation(args: &AblationArgs) -> miette::Result<()> {
             config.mapping.refine.final_epochs = epochs;
             let mut row = |mapped: &MappedLog| -> miette::Result<()> {
                 let held_out = held_out(&recording, &log, &gpu, mapped);
-                rows.push(Row::new(variant, epochs, mapped, held_out?));
+                rows.push(Row::new(variant, epochs, mapped, &held_out?));
                 print(rows.last().expect("one was pushed"));
                 Ok(())
             };
@@ -104,21 +106,22 @@ pub(super) fn ablation(args: &AblationArgs) -> miette::Result<()> {
 }
 
 /// Figures of a map's held-out views.
-fn held_out(recording: &Recording, log: &TrackedLog, gpu: &Arc<Gpu>, mapped: &MappedLog) -> miette::Result<Option<ImageFigures>> {
+fn held_out(recording: &Recording, log: &TrackedLog, gpu: &Arc<Gpu>, mapped: &MappedLog) -> miette::Result<ImageProtocols> {
     let config = recording.config();
     let is_held_out = |index: usize| config.replay.is_held_out(index);
     let poses: Vec<_> = log.poses().iter().filter(|(index, _)| is_held_out(*index)).copied().collect();
     let MappedLog { cloud, exposures, .. } = mapped;
     let selection = ViewSelection { poses: &poses, keyframes: &BTreeSet::new(), is_held_out: &is_held_out, exposures };
     let source = ViewSource { sequence: recording.sequence(), map_scale: config.map_scale, gpu, cloud };
-    Ok(evaluate_views(source, &selection, &mut |_| (), &|_| ()).into_diagnostic()?.held_out)
+    evaluate_views(source, &selection, &mut |_| (), &|_| ()).into_diagnostic()
 }
 
 fn print(row: &Row) {
     let figures = row.held_out.as_ref().map_or_else(String::new, |f| {
         let depth = f.depth_l1_m.map_or_else(String::new, |d| format!("{:.2}", d * 100.0));
         let (psnr, ssim) = (f.psnr_db.unwrap_or_default(), f.ssim.unwrap_or_default());
-        format!("{psnr:.2} | {ssim:.4} | {depth}")
+        let own = row.held_out_map_colors.and_then(|f| f.psnr_db).unwrap_or(psnr);
+        format!("{psnr:.2} | {own:.2} | {ssim:.4} | {depth}")
     });
     let Row { variant, final_epochs, mapping_s, steps, gaussians, .. } = row;
     println!("| {variant} | {final_epochs} | {mapping_s:.1} | {steps} | {gaussians} | {figures} |");

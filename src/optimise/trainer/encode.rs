@@ -1,6 +1,6 @@
 //! The passes after the forward rendering, encoded: loss, backward, and the log of the step.
 
-use super::{Sink, StepLog, Trainer};
+use super::{Sink, StepLog, Trainer, TrainingView};
 use crate::gpu::{GpuBuffer, IndirectSize};
 use crate::optimise::LossConfig;
 use crate::optimise::image_buffers::LOSS_TILE;
@@ -19,23 +19,27 @@ impl Trainer {
         encoder.copy_buffer_to_buffer(counters.raw(), 0, log.raw(), to + counters_at, counters.raw().size());
     }
 
-    pub(super) fn encode_loss(&self, pass: &mut wgpu::ComputePass<'_>, loss: &LossConfig, depth_confidence: f32) {
+    pub(super) fn encode_loss(&self, pass: &mut wgpu::ComputePass<'_>, loss: &LossConfig, view: &TrainingView<'_>) {
         let (gpu, ws, k) = (self.rasterizer.gpu(), &self.rasterizer.workspace, &self.kernels);
         let ((width, height), GpuPixels { color, depth }) = (self.images[0].size, &self.images[0].target);
         let LossConfig { ssim_weight, depth_weight, precise_depth_metres: precise_depth } = *loss;
         let [phase_x, phase_y] = ssim_phase(self.steps);
         let windows = |size: u32, phase: u32| (size + 1 - phase) / 2;
         let pixels_per_window = (width * height) as f32 / (windows(width, phase_x) * windows(height, phase_y)).max(1) as f32;
+        let [red_gain, green_gain, blue_gain] = view.exposure.gains().recip().to_array();
         let setup = LossSetup {
             width,
             height,
             ssim_weight,
             depth_weight,
             precise_depth,
-            depth_confidence,
+            depth_confidence: view.depth_confidence,
             phase_x,
             phase_y,
             pixels_per_window,
+            red_gain,
+            green_gain,
+            blue_gain,
         };
         self.loss_setup.write(gpu, 0, &[setup]);
         let forward = [width.div_ceil(LOSS_TILE), height.div_ceil(LOSS_TILE / 2), 1];
