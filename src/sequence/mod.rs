@@ -23,7 +23,7 @@ use crate::geometry::{Camera, Trajectory};
 
 pub use cameras::is_file as is_camera_file;
 pub use error::SequenceError;
-use files::{decode, files_in, folder_name, images_in, parse_json, read_text};
+use files::{decode, existing, files_in, folder_name, images_in, parse_json, read_text};
 pub use layouts::Layout;
 pub use rectify::{RectifiedImage, Rectifier};
 use stereo::StereoRemap;

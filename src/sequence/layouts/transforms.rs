@@ -14,7 +14,7 @@ use serde::Deserialize;
 
 use super::row::{LayoutRow, SAMPLE_SIZE, parse_text};
 use crate::geometry::{Camera, Distortion, Pinhole, Se3, StampedPose, Trajectory};
-use crate::sequence::{FrameEntry, Sensor, Sequence, SequenceError, checks, folder_name, parse_json, read_text};
+use crate::sequence::{FrameEntry, Sensor, Sequence, SequenceError, checks, existing, folder_name, parse_json, read_text};
 
 const FILE: &str = "transforms.json";
 /// Endings of photos whose path leaves it out.
@@ -44,15 +44,13 @@ fn open(folder: &Path) -> Result<Sequence, SequenceError> {
     let path = folder.join(FILE);
     let content = |what: String| SequenceError::Content { path: path.clone(), what };
     let Transforms { lens, photos } = Transforms::parse(&read_text(&path)?, &path)?;
-    let (mut entries, mut poses) = (Vec::new(), Vec::new());
-    for (index, (file_path, world_from_camera)) in photos.into_iter().enumerate() {
+    let found = photos.into_iter().enumerate().map(|(index, (file_path, world_from_camera))| {
         let timestamp_s = index as f64;
-        let color = photo(folder, &file_path).ok_or_else(|| {
-            content(format!("frame {index}, {file_path}: there is no such file; check that the recording was copied whole"))
-        })?;
-        entries.push(FrameEntry { timestamp_s, color, depth: None, right: None });
-        poses.push(StampedPose { timestamp_s, world_from_camera });
-    }
+        let color = photo(folder, &file_path).ok_or(file_path)?;
+        let entry = FrameEntry { timestamp_s, color, depth: None, right: None };
+        Ok((entry, StampedPose { timestamp_s, world_from_camera }))
+    });
+    let (entries, poses): (Vec<_>, Vec<_>) = existing(&path, found.collect())?.into_iter().unzip();
     let first = &entries.first().ok_or_else(|| SequenceError::Empty { path: path.clone() })?.color;
     let size = image::image_dimensions(first).map_err(|source| SequenceError::Image { path: first.clone(), source })?;
     let camera = lens.camera(size).map_err(content)?;
@@ -218,6 +216,14 @@ mod tests {
     }
 
     #[test]
+    fn a_missing_photo_is_left_out_and_the_others_keep_their_times() {
+        let sequence = open(LENS, &FRAMES.replace("images/b", "images/d")).unwrap();
+        assert_eq!(sequence.entries.iter().map(|entry| entry.timestamp_s).collect::<Vec<_>>(), [1.0]);
+        let poses = sequence.groundtruth.unwrap().poses;
+        assert_eq!((poses.len(), poses[0].timestamp_s, poses[0].world_from_camera.translation.x), (1, 1.0, 1.0));
+    }
+
+    #[test]
     fn an_angle_is_a_lens_and_frames_may_carry_it() {
         let pinhole = open(r#""camera_angle_x": 1.5707963267948966"#, FRAMES).unwrap().camera.pinhole;
         assert!((pinhole.fx - 4.0).abs() < 1e-9 && pinhole.fy == pinhole.fx);
@@ -233,7 +239,8 @@ mod tests {
             let message = open(lens, frames).map(|_| ()).unwrap_err();
             assert!(message.contains("transforms.json") && message.contains(part), "{message}");
         };
-        refused(LENS, &FRAMES.replace("images/a", "images/c"), "frame 1, images/c: there is no such file");
+        let both_gone = FRAMES.replace("images/a", "images/c").replace("images/b", "images/d");
+        refused(LENS, &both_gone, "2 of 2 listed images are missing, among them ./images/d.png");
         refused(LENS, &FRAMES.replacen("[0,0,1,2]", "[0,0,3,2]", 1), "frame 0, ./images/b.png: the first three");
         refused(LENS, &FRAMES.replacen("[0,0,1,2]", "[0,0,1]", 1), "transforms.json:3: ");
         refused(LENS, "[]", "lists no frames");

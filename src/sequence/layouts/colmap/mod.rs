@@ -1,8 +1,8 @@
 //! Photos with a sparse model by COLMAP (Schönberger & Frahm, *Structure-from-Motion Revisited*, CVPR 2016).
 //!
 //! `images/` beside `sparse/0/` (or `sparse/`) with `cameras`, `images` and `points3D`, each `.bin` or `.txt`. The poses are known: they
-//! become the truth, and the points with their colours seed a map. Photos have no times: sorted by name, the n-th has the timestamp of
-//! n seconds. COLMAP's pixels count from the image's corner, ours from the first pixel's centre: principal points move by half a pixel.
+//! become the truth, and the points with their colours seed a map. Photos have no times: sorted by name, the n-th listed one has the
+//! timestamp of n seconds. Up to half of them may be missing. COLMAP's pixels count from the image's corner, ours from the first pixel's centre: principal points move by half a pixel.
 //!
 //! Left out: models of several cameras, and fisheye lenses; both are refused.
 
@@ -18,7 +18,7 @@ use std::path::{Path, PathBuf};
 
 use super::row::{LayoutRow, parse_text};
 use crate::geometry::{Camera, Distortion, Pinhole, Se3, StampedPose, Trajectory};
-use crate::sequence::{FrameEntry, Sensor, Sequence, SequenceError, checks, folder_name, read_text};
+use crate::sequence::{FrameEntry, Sensor, Sequence, SequenceError, checks, existing, folder_name, read_text};
 use binary::Records;
 
 /// COLMAP's camera models in the order of their numbers, with how many parameters each has.
@@ -95,20 +95,15 @@ fn open(folder: &Path) -> Result<Sequence, SequenceError> {
         .ok_or_else(|| format!("there is no camera {}, which the images have", first.camera))
         .and_then(camera_of)
         .map_err(|what| SequenceError::Content { path: cameras_path, what })?;
-    let entry = |(index, image): (usize, &KnownImage)| {
+    let found = images.into_iter().enumerate().map(|(index, image)| {
+        let timestamp_s = index as f64;
         let color = folder.join("images").join(&image.name);
-        if !color.is_file() {
-            let what = format!("there is no photo {}; check that the recording was copied whole", color.display());
-            return Err(SequenceError::Content { path: images_path.clone(), what });
-        }
-        Ok(FrameEntry { timestamp_s: index as f64, color, depth: None, right: None })
-    };
-    let entries = images.iter().enumerate().map(entry).collect::<Result<Vec<_>, _>>()?;
-    let stamped = |(index, image): (usize, &KnownImage)| StampedPose {
-        timestamp_s: index as f64,
-        world_from_camera: image.camera_from_world.inverse(),
-    };
-    let groundtruth = Trajectory { poses: images.iter().enumerate().map(stamped).collect() };
+        let entry = FrameEntry { timestamp_s, color, depth: None, right: None };
+        let pose = StampedPose { timestamp_s, world_from_camera: image.camera_from_world.inverse() };
+        if entry.color.is_file() { Ok((entry, pose)) } else { Err(image.name) }
+    });
+    let (entries, poses) = existing(&images_path, found.collect())?.into_iter().unzip();
+    let groundtruth = Trajectory { poses };
     let sequence = Sequence {
         points,
         groundtruth: Some(groundtruth),

@@ -85,6 +85,17 @@ fn both_forms_give_the_same_photos_poses_and_points() {
 }
 
 #[test]
+fn a_missing_photo_is_left_out_and_the_others_keep_their_times() {
+    let folder = recording();
+    std::fs::remove_file(folder.path().join("images/a.png")).unwrap();
+    let sequence = Sequence::open(folder.path(), None, None).unwrap();
+    let poses = sequence.groundtruth.unwrap().poses;
+    assert_eq!((sequence.entries.len(), sequence.entries[0].timestamp_s), (1, 1.0));
+    assert_eq!((poses.len(), poses[0].timestamp_s), (1, 1.0));
+    assert!((poses[0].world_from_camera * Point3::origin() - Point3::new(-2.0, -3.0, -1.0)).norm() < 1e-12);
+}
+
+#[test]
 fn lenses_are_read_or_refused_by_name() {
     let with = |line: &str| {
         let folder = recording();
@@ -120,7 +131,8 @@ fn damaged_texts_are_refused_with_file_and_line() {
     };
     assert!(spoil("images.txt", IMAGES.replace("4 7 a", "x 7 a")).contains("images.txt:5: `x` is no pose"));
     assert!(spoil("images.txt", IMAGES.replace("1 0 0 0 0", "0 0 0 0 0")).contains("images.txt:5: a pose needs"));
-    assert!(spoil("images.txt", IMAGES.replace("7 a.png", "7 d.png")).contains("no photo"));
+    let both_gone = IMAGES.replace("7 a.png", "7 d.png").replace("b c.png", "b d.png");
+    assert!(spoil("images.txt", both_gone).contains("images.txt: 2 of 2 listed images are missing, among them b d.png"));
     assert!(spoil("images.txt", IMAGES.replace("7 a.png", "8 a.png")).contains("different cameras"));
     assert!(spoil("images.txt", String::new()).contains("images.txt lists no frames"));
     assert!(spoil("points3D.txt", POINTS.replace("255", "256")).contains("points3D.txt:3: `256` is no colour"));
