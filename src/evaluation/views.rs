@@ -128,7 +128,7 @@ pub struct ViewSource<'a> {
     pub cloud: &'a GaussianCloud,
 }
 
-/// Compares all posed views with their renders. Frames that cannot be read are left out. `on_held_out` receives each held-out view, `on_view`
+/// Compares all posed views with their renders. Frames that cannot be read or are masked wholly are left out. `on_held_out` receives each held-out view, `on_view`
 /// the number of views done.
 ///
 /// # Errors
@@ -150,7 +150,7 @@ pub fn evaluate_views(
         let indices: Vec<usize> = poses.iter().map(|(index, _)| *index).collect();
         let frames = sequence.load_all(&indices);
         let recorded: Vec<Option<RectifiedImage>> =
-            frames.into_par_iter().map(|frame| Some(rectifier.rectify(&frame.ok()?))).collect();
+            frames.into_par_iter().map(|frame| Some(rectifier.rectify(&frame.ok()?)).filter(shows_anything)).collect();
         let mut views = Vec::new();
         for ((index, world_from_camera), recorded) in poses.iter().zip(recorded) {
             let Some(recorded) = recorded else { continue };
@@ -176,6 +176,10 @@ pub fn evaluate_views(
         }
     }
     Ok(means.figures())
+}
+
+fn shows_anything(image: &RectifiedImage) -> bool {
+    image.valid.as_ref().is_none_or(|valid| valid.contains(&true))
 }
 
 fn compare(rendered: &Rendered, recorded: &RectifiedImage) -> ViewFigures {

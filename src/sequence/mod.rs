@@ -15,7 +15,7 @@ use std::sync::Arc;
 
 use image::{GrayImage, RgbImage};
 use layouts::{LayoutRow, Video};
-use nalgebra::Vector3;
+use nalgebra::{Vector2, Vector3};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
@@ -107,10 +107,23 @@ pub struct Frame {
     pub depth: Option<DepthImage>,
     /// The right camera's image, same size, row-aligned with `color`.
     pub right: Option<GrayImage>,
+    /// Same size as `color`; pixels of value 0 are to be ignored.
+    pub mask: Option<GrayImage>,
+}
+
+impl Frame {
+    /// Whether the mask keeps the recorded pixel nearest to `pixel`. Without a mask, all are kept.
+    pub fn keeps(&self, pixel: &Vector2<f64>) -> bool {
+        let kept = |mask: &GrayImage| {
+            let value = mask.get_pixel_checked(pixel.x.round() as u32, pixel.y.round() as u32);
+            value.is_some_and(|value| value.0[0] > 0)
+        };
+        self.mask.as_ref().is_none_or(kept)
+    }
 }
 
 /// Where one frame lies on disk.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct FrameEntry {
     /// Seconds, by the clock of the recording.
     pub timestamp_s: f64,
@@ -120,6 +133,8 @@ pub struct FrameEntry {
     pub depth: Option<PathBuf>,
     /// The right image of a stereo pair.
     pub right: Option<PathBuf>,
+    /// Image whose pixels of value 0 are to be ignored.
+    pub mask: Option<PathBuf>,
 }
 
 /// A point of the scene that came with the recording.
@@ -249,7 +264,14 @@ impl Sequence {
         };
         let depth = entry.depth.as_deref().map(|path| self.load_depth(path)).transpose()?;
         let right = entry.right.as_deref().map(|path| self.load_right(path)).transpose()?;
-        Ok(Frame { index, timestamp_s: entry.timestamp_s, color, depth, right })
+        let mask = entry.mask.as_deref().map(|path| self.load_mask(path)).transpose()?;
+        Ok(Frame { index, timestamp_s: entry.timestamp_s, color, depth, right, mask })
+    }
+
+    fn load_mask(&self, path: &Path) -> Result<GrayImage, SequenceError> {
+        let mask = decode(path)?.into_luma8();
+        self.check_size(path, mask.dimensions())?;
+        Ok(mask)
     }
 
     fn load_right(&self, path: &Path) -> Result<GrayImage, SequenceError> {
@@ -288,6 +310,15 @@ impl Sequence {
             if let Ok(size) = image::image_dimensions(path) {
                 self.check_size(path, size)?;
             }
+        }
+        Ok(())
+    }
+
+    /// Compares all masks and depth images with the camera.
+    fn check_mask_and_depth_sizes(&self) -> Result<(), SequenceError> {
+        for path in self.entries.iter().flat_map(|entry| [&entry.mask, &entry.depth]).flatten() {
+            let size = image::image_dimensions(path).map_err(|source| SequenceError::Image { path: path.clone(), source })?;
+            self.check_size(path, size)?;
         }
         Ok(())
     }

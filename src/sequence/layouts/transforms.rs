@@ -3,9 +3,13 @@
 //! `frames` lists photos (`file_path`, with or without its extension) and their `transform_matrix`, camera to world, of OpenGL's camera: x
 //! right, y up, z backward; ours has y down, z forward. The lens is `fl_x fl_y cx cy w h k1 k2 k3 p1 p2`, for all frames or the same in
 //! each, or `camera_angle_x` alone. Principal points count from the image's corner, ours from the first pixel's centre. Frames stay in the
-//! order of the file, the n-th has the timestamp of n seconds.
+//! order of the file, the n-th listed one has the timestamp of n seconds. Up to half of the photos may be missing.
 //!
-//! Left out: several cameras and fisheye lenses, which are refused; depth images, masks and point clouds, which are not read.
+//! After nerfstudio, `mask_path` is an image whose black pixels are ignored, and `depth_file_path` a 16-bit image in units of
+//! `depth_unit_scale_factor`, a thousandth of the poses' unit by default. With one depth image the recording is RGB-D; frames without
+//! depth are then as those of a sensor that measured nothing.
+//!
+//! Left out: several cameras and fisheye lenses, which are refused; point clouds, which are not read.
 
 use std::path::{Path, PathBuf};
 
@@ -17,6 +21,8 @@ use crate::geometry::{Camera, Distortion, Pinhole, Se3, StampedPose, Trajectory}
 use crate::sequence::{FrameEntry, Sensor, Sequence, SequenceError, checks, existing, folder_name, parse_json, read_text};
 
 const FILE: &str = "transforms.json";
+/// The unit of depth images in that of the poses: millimetres where these are metres.
+const DEPTH_UNIT: f64 = 1e-3;
 /// Endings of photos whose path leaves it out.
 const ENDINGS: [&str; 4] = ["", ".png", ".jpg", ".jpeg"];
 
@@ -31,7 +37,7 @@ pub(super) const LAYOUT: LayoutRow = LayoutRow {
     parse: |bytes| {
         parse_text(bytes, |text, path| {
             let what = |what| SequenceError::Content { path: path.into(), what };
-            vec![Transforms::parse(text, path).and_then(|file| file.lens.camera(SAMPLE_SIZE).map(drop).map_err(what))]
+            vec![Transforms::parse(text, path).and_then(|file| file.camera(SAMPLE_SIZE).map(drop).map_err(what))]
         })
     },
 };
@@ -43,49 +49,76 @@ fn recognise(folder: &Path) -> bool {
 fn open(folder: &Path) -> Result<Sequence, SequenceError> {
     let path = folder.join(FILE);
     let content = |what: String| SequenceError::Content { path: path.clone(), what };
-    let Transforms { lens, photos } = Transforms::parse(&read_text(&path)?, &path)?;
-    let found = photos.into_iter().enumerate().map(|(index, (file_path, world_from_camera))| {
+    let mut file = Transforms::parse(&read_text(&path)?, &path)?;
+    let photos = std::mem::take(&mut file.photos).into_iter().enumerate();
+    let found = photos
+        .map(|(index, photo)| Ok((index, image_file(folder, &photo.file_path).ok_or_else(|| photo.file_path.clone())?, photo)));
+    let (mut entries, mut poses) = (Vec::new(), Vec::new());
+    for (index, color, photo) in existing(&path, found.collect())? {
+        let beside = |name: &Option<String>| {
+            let missing = |name: &String| {
+                content(format!("frame {index}, {name}: there is no such file; copy the recording whole, or take its name out"))
+            };
+            name.as_ref().map(|name| image_file(folder, name).ok_or_else(|| missing(name))).transpose()
+        };
+        let (mask, depth) = (beside(&photo.mask_path)?, beside(&photo.depth_file_path)?);
         let timestamp_s = index as f64;
-        let color = photo(folder, &file_path).ok_or(file_path)?;
-        let entry = FrameEntry { timestamp_s, color, depth: None, right: None };
-        Ok((entry, StampedPose { timestamp_s, world_from_camera }))
-    });
-    let (entries, poses): (Vec<_>, Vec<_>) = existing(&path, found.collect())?.into_iter().unzip();
+        entries.push(FrameEntry { timestamp_s, color, depth, mask, ..FrameEntry::default() });
+        poses.push(StampedPose { timestamp_s, world_from_camera: photo.world_from_camera });
+    }
     let first = &entries.first().ok_or_else(|| SequenceError::Empty { path: path.clone() })?.color;
     let size = image::image_dimensions(first).map_err(|source| SequenceError::Image { path: first.clone(), source })?;
-    let camera = lens.camera(size).map_err(content)?;
+    let camera = file.camera(size).map_err(content)?;
+    let sensor = if entries.iter().any(|entry| entry.depth.is_some()) { Sensor::Rgbd } else { Sensor::Mono };
     let groundtruth = Some(Trajectory { poses });
-    let name = folder_name(folder);
-    let sequence = Sequence { groundtruth, ..Sequence::new(name, &LAYOUT, camera, Sensor::Mono, entries) };
+    let sequence = Sequence { groundtruth, ..Sequence::new(folder_name(folder), &LAYOUT, camera, sensor, entries) };
     sequence.check_first_size()?;
+    sequence.check_mask_and_depth_sizes()?;
     Ok(sequence)
 }
 
 /// Checked content of the file.
-pub(super) struct Transforms {
-    pub lens: Lens,
-    /// Each photo's path as it is written, and world_from_camera.
-    pub photos: Vec<(String, Se3)>,
+struct Transforms {
+    lens: Lens,
+    depth_unit: f64,
+    photos: Vec<Photo>,
+}
+
+/// A listed photo; paths as they are written.
+struct Photo {
+    file_path: String,
+    mask_path: Option<String>,
+    depth_file_path: Option<String>,
+    world_from_camera: Se3,
 }
 
 impl Transforms {
     /// `path` is named in errors.
-    pub fn parse(text: &str, path: &Path) -> Result<Self, SequenceError> {
+    fn parse(text: &str, path: &Path) -> Result<Self, SequenceError> {
         let content = |what: String| SequenceError::Content { path: path.into(), what };
         let file: TransformsFile = parse_json(text, path)?;
         let lens = file.lens().map_err(content)?;
         let opengl_from_camera = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI);
-        let pose = |(index, frame): (usize, ListedFrame)| {
-            let world_from_opengl = checks::rigid(frame.transform_matrix.as_flattened())
-                .map_err(|what| content(format!("frame {index}, {}: {what}", frame.file_path)))?;
-            Ok::<_, SequenceError>((frame.file_path, world_from_opengl * opengl_from_camera))
+        let photo = |(index, frame): (usize, ListedFrame)| {
+            let ListedFrame { file_path, mask_path, depth_file_path, transform_matrix, .. } = frame;
+            let world_from_opengl = checks::rigid(transform_matrix.as_flattened())
+                .map_err(|what| content(format!("frame {index}, {file_path}: {what}")))?;
+            let world_from_camera = world_from_opengl * opengl_from_camera;
+            Ok::<_, SequenceError>(Photo { file_path, mask_path, depth_file_path, world_from_camera })
         };
-        Ok(Self { lens, photos: file.frames.into_iter().enumerate().map(pose).collect::<Result<_, SequenceError>>()? })
+        let depth_unit = file.depth_unit_scale_factor.unwrap_or(DEPTH_UNIT);
+        let photos = file.frames.into_iter().enumerate().map(photo).collect::<Result<_, SequenceError>>()?;
+        Ok(Self { lens, depth_unit, photos })
+    }
+
+    /// The camera of photos of that size, if the lens does not say its own.
+    fn camera(&self, size: (u32, u32)) -> Result<Camera, String> {
+        checks::camera(Camera { depth_units_per_metre: 1.0 / self.depth_unit, ..self.lens.camera(size)? })
     }
 }
 
-/// The photo that a path means.
-fn photo(folder: &Path, file_path: &str) -> Option<PathBuf> {
+/// The image that a path means.
+fn image_file(folder: &Path, file_path: &str) -> Option<PathBuf> {
     ENDINGS.iter().map(|ending| folder.join(format!("{file_path}{ending}"))).find(|path| path.is_file())
 }
 
@@ -96,12 +129,15 @@ struct TransformsFile {
     is_fisheye: bool,
     #[serde(flatten)]
     lens: Lens,
+    depth_unit_scale_factor: Option<f64>,
     frames: Vec<ListedFrame>,
 }
 
 #[derive(Deserialize)]
 struct ListedFrame {
     file_path: String,
+    mask_path: Option<String>,
+    depth_file_path: Option<String>,
     transform_matrix: [[f64; 4]; 4],
     #[serde(flatten)]
     lens: Lens,
@@ -110,7 +146,7 @@ struct ListedFrame {
 /// Pixels, and radians across the whole image.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Deserialize)]
 #[serde(default)]
-pub(super) struct Lens {
+struct Lens {
     camera_angle_x: Option<f64>,
     camera_angle_y: Option<f64>,
     fl_x: Option<f64>,
@@ -150,8 +186,8 @@ impl Lens {
         self.fl_x.is_some() || self.camera_angle_x.is_some()
     }
 
-    /// The camera of photos of that size, if it does not say its own.
-    pub fn camera(&self, (width, height): (u32, u32)) -> Result<Camera, String> {
+    /// The camera of photos of that size, if it does not say its own; without a unit of depth.
+    fn camera(&self, (width, height): (u32, u32)) -> Result<Camera, String> {
         let (w, h) = (self.w.unwrap_or(f64::from(width)), self.h.unwrap_or(f64::from(height)));
         let side = |pixels: f64| {
             let whole = (pixels.fract() == 0.0 && pixels > 0.0).then_some(pixels as u64);
@@ -167,7 +203,7 @@ impl Lens {
         let (cx, cy) = (self.cx.unwrap_or(w / 2.0) - 0.5, self.cy.unwrap_or(h / 2.0) - 0.5);
         let pinhole = Pinhole { fx, fy, cx, cy, width: side(w)?, height: side(h)? };
         let distortion = Distortion { k1: self.k1, k2: self.k2, p1: self.p1, p2: self.p2, k3: self.k3 };
-        checks::camera(Camera { pinhole, distortion, depth_units_per_metre: 1.0 })
+        Ok(Camera { pinhole, distortion, depth_units_per_metre: 1.0 })
     }
 }
 
@@ -213,6 +249,40 @@ mod tests {
         // A point below the image's centre is towards -y of the world, as its top is towards +y.
         assert!((on_floor(0, 0.5, 1.0) - Point3::new(0.5, -1.0, 0.0)).norm() < 1e-12);
         assert!((on_floor(1, 0.0, 0.0) - Point3::new(1.0, 0.0, 0.0)).norm() < 1e-12);
+    }
+
+    /// The first frame has a mask and a depth image, in millimetres; the second has neither.
+    fn with_mask_and_depth() -> String {
+        FRAMES.replacen("\"sharpness\": 3", "\"mask_path\": \"masks/b.png\", \"depth_file_path\": \"depth/b.png\"", 1)
+    }
+
+    #[test]
+    fn masks_and_depth_are_read() {
+        let folder = recording(LENS, &with_mask_and_depth());
+        let image = |name: &str| folder.path().join(name);
+        ["masks", "depth"].iter().for_each(|name| std::fs::create_dir(image(name)).unwrap());
+        let open = || Sequence::open(folder.path(), None, None).map_err(|error| error.to_string());
+        assert!(open().unwrap_err().contains("frame 0, masks/b.png: there is no such file"));
+        image::GrayImage::from_fn(8, 6, |x, _| image::Luma([u8::from(x > 0)])).save(image("masks/b.png")).unwrap();
+        assert!(open().unwrap_err().contains("frame 0, depth/b.png: there is no such file"));
+        let depth = image::ImageBuffer::from_fn(8, 6, |x, y| image::Luma([(1000 * x + y) as u16]));
+        depth.save(image("depth/b.png")).unwrap();
+        let sequence = open().unwrap();
+        assert_eq!(sequence.sensor, Sensor::Rgbd);
+        let frames = sequence.load_all(&[0, 1]).into_iter().map(Result::unwrap).collect::<Vec<_>>();
+        assert_eq!(frames[0].depth.as_ref().unwrap().at(2, 3), Some(2.003));
+        assert_eq!([0, 1].map(|x| frames[0].mask.as_ref().unwrap().get_pixel(x, 0).0[0]), [0, 1]);
+        assert!(frames[1].depth.is_none() && frames[1].mask.is_none());
+        image::GrayImage::new(8, 7).save(image("masks/b.png")).unwrap();
+        let message = open().unwrap_err();
+        assert!(message.contains("masks/b.png is 8x7, but the camera is 8x6"), "{message}");
+    }
+
+    #[test]
+    fn the_file_may_say_the_unit_of_its_depth() {
+        let unit = |factor: &str| open(&format!("{LENS}, \"depth_unit_scale_factor\": {factor}"), FRAMES);
+        assert_eq!(unit("0.25").unwrap().camera.depth_units_per_metre, 4.0);
+        assert!(unit("0").unwrap_err().contains("depth units"));
     }
 
     #[test]

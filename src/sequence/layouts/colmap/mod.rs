@@ -98,7 +98,7 @@ fn open(folder: &Path) -> Result<Sequence, SequenceError> {
     let found = images.into_iter().enumerate().map(|(index, image)| {
         let timestamp_s = index as f64;
         let color = folder.join("images").join(&image.name);
-        let entry = FrameEntry { timestamp_s, color, depth: None, right: None };
+        let entry = FrameEntry { timestamp_s, color, ..FrameEntry::default() };
         let pose = StampedPose { timestamp_s, world_from_camera: image.camera_from_world.inverse() };
         if entry.color.is_file() { Ok((entry, pose)) } else { Err(image.name) }
     });

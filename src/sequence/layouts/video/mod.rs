@@ -72,7 +72,7 @@ fn open(path: &Path, camera: Option<&str>) -> Result<Sequence, SequenceError> {
         sequence.check_size(&path, (width, height))
     };
     let video = Video::scan(&path, is_cut, usual_fps, &check_size)?;
-    let entry = |&timestamp_s| FrameEntry { timestamp_s, color: path.clone(), depth: None, right: None };
+    let entry = |&timestamp_s| FrameEntry { timestamp_s, color: path.clone(), ..FrameEntry::default() };
     sequence.entries = video.times_s.iter().map(entry).collect();
     sequence.video = Some(Arc::new(video));
     Ok(sequence)
