@@ -15,7 +15,8 @@ use crate::geometry::{Se3, StampedPose};
 use crate::mapping::{DepthSource, Keyframe, MapperMessage, MappingConfig};
 use crate::recording::Recording;
 use crate::run_folder::FrameRecord;
-use crate::sequence::{Frame, KnownPoint, Rectifier, Sensor};
+use crate::sequence::{Frame, FrameEntry, KnownPoint, Rectifiers, Sensor};
+use crate::splat::ViewCamera;
 use crate::tracking::{KeyframePose, StageTimes};
 
 /// Median depth for which the mapper's lengths are chosen, metres: that of a room.
@@ -38,10 +39,10 @@ fn units_per_metre(recording: &Recording) -> f64 {
 fn scene_distance(recording: &Recording) -> Option<f64> {
     let sequence = recording.sequence();
     let sample = |len: usize, most: usize| (0..len).step_by(len.div_ceil(most).max(1));
-    let pinhole = &sequence.camera.pinhole;
     let mut depths = Vec::new();
-    for entry in sample(sequence.entries.len(), SAMPLED_CAMERAS).map(|i| &sequence.entries[i]) {
-        let Some(world_from_camera) = recording.known_pose(entry.timestamp_s) else { continue };
+    for index in sample(sequence.entries.len(), SAMPLED_CAMERAS) {
+        let Some(world_from_camera) = recording.known_pose(sequence.entries[index].timestamp_s) else { continue };
+        let pinhole = &sequence.camera_of(index).pinhole;
         let camera_from_world = world_from_camera.inverse();
         for point in sample(sequence.points.len(), SAMPLED_POINTS).map(|i| &sequence.points[i]) {
             let p_in_camera = (camera_from_world * Point3::from(point.position)).coords;
@@ -61,16 +62,21 @@ fn median(mut values: Vec<f64>) -> Option<f64> {
 /// would only cost time. Points that no frame sees are left out.
 fn thinned_points(recording: &Recording) -> Vec<KnownPoint> {
     let (sequence, config) = (recording.sequence(), recording.config());
-    let poses = sequence.entries.iter().filter_map(|entry| recording.known_pose(entry.timestamp_s));
-    let cameras: Vec<Se3> = poses.map(|world_from_camera| world_from_camera.inverse()).collect();
-    let pinhole = &sequence.camera.pinhole;
-    let cell_per_depth = f64::from(config.mapping.points.spacing_pixels) / (pinhole.fx * config.map_scale);
+    let camera = |(index, entry): (usize, &FrameEntry)| {
+        let camera_from_world = recording.known_pose(entry.timestamp_s)?.inverse();
+        Some(ViewCamera { pinhole: sequence.camera_of(index).pinhole, camera_from_world })
+    };
+    let cameras: Vec<ViewCamera> = sequence.entries.iter().enumerate().filter_map(camera).collect();
+    let spacing_pixels = f64::from(config.mapping.points.spacing_pixels) / config.map_scale;
     let cell = |point: &KnownPoint| {
-        let in_cameras = cameras.iter().map(|camera_from_world| (camera_from_world * Point3::from(point.position)).coords);
-        let seen = in_cameras.filter(|p| pinhole.project(p).is_some_and(|pixel| pinhole.contains(&pixel, 0.0)));
-        let depth = seen.map(|p| p.z).min_by(f64::total_cmp)?;
+        let pixel_size = |ViewCamera { pinhole, camera_from_world }: &ViewCamera| {
+            let p_in_camera = (camera_from_world * Point3::from(point.position)).coords;
+            let seen = pinhole.project(&p_in_camera).is_some_and(|pixel| pinhole.contains(&pixel, 0.0));
+            seen.then_some(p_in_camera.z / pinhole.fx)
+        };
+        let nearest = cameras.iter().filter_map(pixel_size).min_by(f64::total_cmp)?;
         // Sides are powers of two, so that cubes of like distances are the same ones.
-        let level = (depth * cell_per_depth).log2().round();
+        let level = (nearest * spacing_pixels).log2().round();
         Some((level as i64, point.position.map(|v| (v / level.exp2()).floor() as i64)))
     };
     let cells: Vec<Option<(i64, Vector3<i64>)>> = sequence.points.par_iter().map(cell).collect();
@@ -99,7 +105,7 @@ struct Known {
 
 struct Follower<'a> {
     recording: &'a Recording,
-    rectifier: Rectifier,
+    rectifiers: Rectifiers,
     keyframes: Vec<Known>,
     /// Where frames have no depth.
     scene_distance: f64,
@@ -129,7 +135,7 @@ impl Follower<'_> {
     }
 
     fn make_keyframe(&mut self, frame: &Frame, world_from_camera: Se3) -> Keyframe {
-        let image = self.rectifier.rectify(frame);
+        let image = self.rectifiers.of(self.recording.sequence().camera_of(frame.index)).rectify(frame);
         let (id, covisible) = (self.keyframes.len(), self.covisible(&world_from_camera));
         let pose = KeyframePose { id, frame_index: frame.index, timestamp_s: frame.timestamp_s, world_from_camera };
         let distance = image.median_depth_metres().unwrap_or(self.scene_distance);
@@ -144,9 +150,9 @@ pub(super) fn follow(thread: &TrackThread<'_>) -> TrackSummary {
     let (sequence, config) = (recording.sequence(), recording.config());
     let mut summary = TrackSummary::default();
     let mut sender = KeyframeSender::new(mapper, config.replay.real_time);
-    let rectifier = Rectifier::new(&sequence.camera, config.map_scale);
+    let rectifiers = Rectifiers::new(config.map_scale);
     let scene_distance = scene_distance(recording).unwrap_or(USUAL_DISTANCE_METRES);
-    let mut follower = Follower { recording, rectifier, keyframes: Vec::new(), scene_distance };
+    let mut follower = Follower { recording, rectifiers, keyframes: Vec::new(), scene_distance };
     if sequence.sensor != Sensor::Rgbd && mapper.send(MapperMessage::Points(thinned_points(recording))).is_err() {
         return summary;
     }

@@ -25,7 +25,7 @@ pub use cameras::is_file as is_camera_file;
 pub use error::SequenceError;
 use files::{decode, existing, files_in, folder_name, images_in, parse_json, read_text};
 pub use layouts::Layout;
-pub use rectify::{RectifiedImage, Rectifier};
+pub use rectify::{RectifiedImage, Rectifier, Rectifiers};
 use stereo::StereoRemap;
 
 /// Sensor of a recording: the images of a frame.
@@ -135,6 +135,8 @@ pub struct FrameEntry {
     pub right: Option<PathBuf>,
     /// Image whose pixels of value 0 are to be ignored.
     pub mask: Option<PathBuf>,
+    /// The frame's camera where it is not that of the sequence.
+    pub camera: Option<Camera>,
 }
 
 /// A point of the scene that came with the recording.
@@ -153,7 +155,7 @@ pub struct Sequence {
     pub name: String,
     /// Dataset layout.
     pub layout: Layout,
-    /// The colour camera; the left one of a stereo pair.
+    /// The colour camera; the left one of a stereo pair. The first frame's, where photos have several: see [`Self::camera_of`].
     pub camera: Camera,
     /// Images of a frame.
     pub sensor: Sensor,
@@ -191,9 +193,9 @@ impl Sequence {
         layout.open(folder, camera)
     }
 
-    /// A recording without truth and known points.
+    /// A recording without truth and known points. Frames that bring no camera have `camera`.
     fn new(name: String, layout: &'static LayoutRow, camera: Camera, sensor: Sensor, entries: Vec<FrameEntry>) -> Self {
-        Self {
+        let mut sequence = Self {
             name,
             layout: Layout::of(layout),
             camera,
@@ -203,7 +205,28 @@ impl Sequence {
             points: Vec::new(),
             remap: None,
             video: None,
+        };
+        sequence.share_camera();
+        sequence
+    }
+
+    /// Makes the first frame's camera that of the sequence; frames of another camera keep theirs.
+    fn share_camera(&mut self) {
+        let before = self.camera;
+        self.camera = self.entries.first().and_then(|entry| entry.camera).unwrap_or(before);
+        for entry in &mut self.entries {
+            entry.camera = Some(entry.camera.unwrap_or(before)).filter(|camera| *camera != self.camera);
         }
+    }
+
+    /// The camera of frame `index`.
+    pub fn camera_of(&self, index: usize) -> &Camera {
+        self.entries[index].camera.as_ref().unwrap_or(&self.camera)
+    }
+
+    /// Whether all frames have one camera.
+    pub fn has_one_camera(&self) -> bool {
+        self.entries.iter().all(|entry| entry.camera.is_none())
     }
 
     /// Takes from the recording only what a sensor of this kind gives: a monocular replay of an RGB-D recording leaves its depth out.
@@ -236,6 +259,7 @@ impl Sequence {
         }
         let end = range.end.min(len);
         self.entries = self.entries[range.start..end].iter().step_by(every.max(1)).cloned().collect();
+        self.share_camera();
         Ok(())
     }
 
@@ -252,52 +276,28 @@ impl Sequence {
     /// # Errors
     /// [`SequenceError`] if an image is missing, damaged, or not of the camera's size.
     pub fn load(&self, index: usize) -> Result<Frame, SequenceError> {
-        let entry = &self.entries[index];
+        let (entry, camera) = (&self.entries[index], self.camera_of(index));
         let color = match &self.video {
             Some(video) => video.load(entry.timestamp_s)?.into(),
             None => decode(&entry.color)?,
         };
-        self.check_size(&entry.color, (color.width(), color.height()))?;
+        check_size(camera, &entry.color, (color.width(), color.height()))?;
         let color = match &self.remap {
             Some(remap) => remap.left(color),
             None => color.into_rgb8(),
         };
-        let depth = entry.depth.as_deref().map(|path| self.load_depth(path)).transpose()?;
+        let depth = entry.depth.as_deref().map(|path| load_depth(camera, path)).transpose()?;
         let right = entry.right.as_deref().map(|path| self.load_right(path)).transpose()?;
-        let mask = entry.mask.as_deref().map(|path| self.load_mask(path)).transpose()?;
+        let mask = entry.mask.as_deref().map(|path| load_mask(camera, path)).transpose()?;
         Ok(Frame { index, timestamp_s: entry.timestamp_s, color, depth, right, mask })
-    }
-
-    fn load_mask(&self, path: &Path) -> Result<GrayImage, SequenceError> {
-        let mask = decode(path)?.into_luma8();
-        self.check_size(path, mask.dimensions())?;
-        Ok(mask)
     }
 
     fn load_right(&self, path: &Path) -> Result<GrayImage, SequenceError> {
         let image = decode(path)?.into_luma8();
-        self.check_size(path, image.dimensions())?;
+        check_size(&self.camera, path, image.dimensions())?;
         Ok(match &self.remap {
             Some(remap) => remap.right(&image),
             None => image,
-        })
-    }
-
-    fn load_depth(&self, path: &Path) -> Result<DepthImage, SequenceError> {
-        let image::DynamicImage::ImageLuma16(raw) = decode(path)? else {
-            return Err(SequenceError::DepthFormat { path: path.into() });
-        };
-        self.check_size(path, raw.dimensions())?;
-        let metres_per_unit = (1.0 / self.camera.depth_units_per_metre) as f32;
-        let (width, height) = raw.dimensions();
-        Ok(DepthImage {
-            width,
-            height,
-            metres: raw
-                .into_raw()
-                .into_iter()
-                .map(|units| if units == NOT_MEASURED { 0.0 } else { f32::from(units) * metres_per_unit })
-                .collect(),
         })
     }
 
@@ -308,27 +308,46 @@ impl Sequence {
         for path in paths.flatten() {
             // A first frame that cannot be read at all is met again, and counted, when it is loaded.
             if let Ok(size) = image::image_dimensions(path) {
-                self.check_size(path, size)?;
+                check_size(&self.camera, path, size)?;
             }
         }
         Ok(())
     }
 
-    /// Compares all masks and depth images with the camera.
+    /// Compares all masks and depth images with their cameras.
     fn check_mask_and_depth_sizes(&self) -> Result<(), SequenceError> {
-        for path in self.entries.iter().flat_map(|entry| [&entry.mask, &entry.depth]).flatten() {
-            let size = image::image_dimensions(path).map_err(|source| SequenceError::Image { path: path.clone(), source })?;
-            self.check_size(path, size)?;
+        for (index, entry) in self.entries.iter().enumerate() {
+            for path in [&entry.mask, &entry.depth].into_iter().flatten() {
+                let size = image::image_dimensions(path).map_err(|source| SequenceError::Image { path: path.clone(), source })?;
+                check_size(self.camera_of(index), path, size)?;
+            }
         }
         Ok(())
     }
+}
 
-    fn check_size(&self, path: &Path, (found_width, found_height): (u32, u32)) -> Result<(), SequenceError> {
-        let (width, height) = (self.camera.pinhole.width, self.camera.pinhole.height);
-        if (found_width, found_height) == (width, height) {
-            Ok(())
-        } else {
-            Err(SequenceError::Size { path: path.into(), width, height, found_width, found_height })
-        }
+fn load_mask(camera: &Camera, path: &Path) -> Result<GrayImage, SequenceError> {
+    let mask = decode(path)?.into_luma8();
+    check_size(camera, path, mask.dimensions())?;
+    Ok(mask)
+}
+
+fn load_depth(camera: &Camera, path: &Path) -> Result<DepthImage, SequenceError> {
+    let image::DynamicImage::ImageLuma16(raw) = decode(path)? else {
+        return Err(SequenceError::DepthFormat { path: path.into() });
+    };
+    check_size(camera, path, raw.dimensions())?;
+    let metres_per_unit = (1.0 / camera.depth_units_per_metre) as f32;
+    let (width, height) = raw.dimensions();
+    let metres = |units| if units == NOT_MEASURED { 0.0 } else { f32::from(units) * metres_per_unit };
+    Ok(DepthImage { width, height, metres: raw.into_raw().into_iter().map(metres).collect() })
+}
+
+fn check_size(camera: &Camera, path: &Path, (found_width, found_height): (u32, u32)) -> Result<(), SequenceError> {
+    let (width, height) = (camera.pinhole.width, camera.pinhole.height);
+    if (found_width, found_height) == (width, height) {
+        Ok(())
+    } else {
+        Err(SequenceError::Size { path: path.into(), width, height, found_width, found_height })
     }
 }

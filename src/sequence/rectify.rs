@@ -147,6 +147,34 @@ impl Rectifier {
     }
 }
 
+/// Rectifiers that are kept: a table has megabytes, and each photo may have a camera of its own.
+const RECTIFIERS_KEPT: usize = 4;
+
+/// Rectifiers of several cameras, made when they are needed; the last few are kept.
+#[derive(Debug)]
+pub struct Rectifiers {
+    scale: f64,
+    /// The last one used first.
+    kept: Vec<(Camera, Arc<Rectifier>)>,
+}
+
+impl Rectifiers {
+    /// Of images `scale` times the recorded size, as in [`Rectifier::new`].
+    pub fn new(scale: f64) -> Self {
+        Self { scale, kept: Vec::new() }
+    }
+
+    /// The rectifier of a camera.
+    pub fn of(&mut self, camera: &Camera) -> Arc<Rectifier> {
+        let place = self.kept.iter().position(|(of, _)| of == camera);
+        let found = place.map(|place| self.kept.remove(place));
+        let (of, rectifier) = found.unwrap_or_else(|| (*camera, Arc::new(Rectifier::new(camera, self.scale))));
+        self.kept.insert(0, (of, rectifier.clone()));
+        self.kept.truncate(RECTIFIERS_KEPT);
+        rectifier
+    }
+}
+
 /// Mean of bilinear samples.
 fn box_filter<P: Pixel<Subpixel = u8>, const C: usize>(image: &ImageBuffer<P, Vec<u8>>, sources: &[[f32; 2]]) -> [u8; C] {
     let mut sum = [0.0f32; C];
@@ -237,6 +265,19 @@ mod tests {
         assert_eq!(valid(-0.2, 0.5), [true; 4]);
         assert_eq!(valid(-1.5, 1.0), [false, false, true, true]);
         assert!(Rectifier::new(&camera(Distortion::default()), 0.3).valid.is_none());
+    }
+
+    #[test]
+    fn rectifiers_of_the_last_few_cameras_are_kept() {
+        let cameras: Vec<Camera> =
+            (0..8).map(|i| camera(Distortion { k1: 0.01 * f64::from(i), ..Distortion::default() })).collect();
+        let mut rectifiers = Rectifiers::new(0.5);
+        let first = rectifiers.of(&cameras[0]);
+        assert!(cameras[1..4].iter().all(|camera| !Arc::ptr_eq(&first, &rectifiers.of(camera))));
+        assert!(Arc::ptr_eq(&first, &rectifiers.of(&cameras[0])));
+        cameras[4..].iter().for_each(|camera| drop(rectifiers.of(camera)));
+        assert!(!Arc::ptr_eq(&first, &rectifiers.of(&cameras[0])), "it was let go");
+        assert_eq!((rectifiers.kept.len(), Arc::strong_count(&first)), (RECTIFIERS_KEPT, 1));
     }
 
     /// A mapping pixel with one masked pixel below it is not valid, and has no depth.

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use crate::common::recording::{
     FRAMES, HEIGHT, WIDTH, copy_of_recording, finish, metrics, recording, run_command, scratch, skipped_without_adapter, stamps,
 };
+use image::imageops::{FilterType, resize};
 use image::{GrayImage, ImageBuffer, Luma, Rgb};
 use keysplat::sequence::Sequence;
 use nalgebra::Vector2;
@@ -82,6 +83,33 @@ fn photos_are_mapped_from_points_whatever_their_unit() {
     });
     // Cubes of points are powers of two of the unit, so the two maps begin with a tenth more or fewer points.
     assert!(psnr[0] > 24.0 && (psnr[0] - psnr[1]).abs() < 1.0, "{psnr:?}");
+}
+
+/// The photos of [`colmap`], every second one at half its size with a camera of its own.
+#[test]
+fn photos_of_several_cameras_are_mapped_and_not_tracked() {
+    let photos = colmap("cameras", 1.0);
+    let model = photos.join("sparse/0");
+    let p = Sequence::open(recording(), None, None).unwrap().camera.pinhole.scaled(0.5);
+    let mut cameras = std::fs::read_to_string(model.join("cameras.txt")).unwrap();
+    cameras += &format!("2 PINHOLE {} {} {} {} {} {}\n", p.width, p.height, p.fx, p.fy, p.cx + 0.5, p.cy + 0.5);
+    let mut images = std::fs::read_to_string(model.join("images.txt")).unwrap();
+    for index in (1..FRAMES).step_by(2) {
+        let photo = photos.join(format!("images/{index:03}.png"));
+        let half = resize(&image::open(&photo).unwrap().into_rgb8(), p.width, p.height, FilterType::Triangle);
+        half.save(photo).unwrap();
+        images = images.replace(&format!(" 1 {index:03}.png"), &format!(" 2 {index:03}.png"));
+    }
+    std::fs::write(model.join("cameras.txt"), cameras).unwrap();
+    std::fs::write(model.join("images.txt"), images).unwrap();
+    let tracked = finish(run_command(&photos, &scratch().join("not-tracked"), &[]));
+    tracked.refused(&["different cameras", "--known-poses"]);
+    if skipped_without_adapter() {
+        return;
+    }
+    let m = metrics(&run("of-cameras", &photos));
+    assert_eq!((m.keyframes, m.frames_tracked), (Some(FRAMES as u64 - 3), FRAMES as u64), "{m}");
+    assert!(m.images.all_frames.unwrap().psnr_db.unwrap() > 22.0, "{m}");
 }
 
 /// The recording as nerfstudio's photos with depth in millimetres and masks, which hide a square that is not of the scene.
