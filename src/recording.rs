@@ -53,14 +53,6 @@ pub enum RecordingError {
         /// Largest difference of timestamps, seconds.
         seconds: f64,
     },
-    /// `replay.known_poses` without depth and without points.
-    #[error(
-        "{name} has neither depth nor points to begin a map from; give COLMAP's model with its points (sparse/0/points3D.bin), or leave --known-poses out"
-    )]
-    NoKnownPoints {
-        /// Name of the recording.
-        name: String,
-    },
     /// Images below the SSIM window's size.
     #[error(
         "images would be mapped at {width}x{height}, but the least is {least}x{least}; raise the mapping resolution (--map-scale)"
@@ -81,7 +73,7 @@ impl Recording {
     ///
     /// # Errors
     /// If the configuration names no recording, the dataset cannot be read, images are too small to be compared, or `replay.known_poses` is
-    /// set and poses, or anything to begin a map from, are missing.
+    /// set and poses are missing.
     pub fn open(mut config: Config) -> Result<Self, RecordingError> {
         config.validate()?;
         let named = config.sequence.as_ref().ok_or(RecordingError::Unnamed)?;
@@ -165,11 +157,9 @@ impl Recording {
     }
 
     fn check_known_poses(&self) -> Result<(), RecordingError> {
-        let name = || self.sequence.name.clone();
-        if !self.sequence.entries.iter().any(|entry| self.known_pose(entry.timestamp_s).is_some()) {
-            return Err(RecordingError::NoKnownPoses { name: name(), seconds: MAX_TIME_DIFFERENCE_S });
+        if self.sequence.entries.iter().any(|entry| self.known_pose(entry.timestamp_s).is_some()) {
+            return Ok(());
         }
-        let begins = self.sequence.sensor == Sensor::Rgbd || !self.sequence.points.is_empty();
-        if begins { Ok(()) } else { Err(RecordingError::NoKnownPoints { name: name() }) }
+        Err(RecordingError::NoKnownPoses { name: self.sequence.name.clone(), seconds: MAX_TIME_DIFFERENCE_S })
     }
 }

@@ -112,6 +112,25 @@ fn photos_of_several_cameras_are_mapped_and_not_tracked() {
     assert!(m.images.all_frames.unwrap().psnr_db.unwrap() > 22.0, "{m}");
 }
 
+/// Points of the photos themselves do as well as those of the model.
+#[test]
+fn a_scene_without_points_begins_from_its_photos() {
+    if skipped_without_adapter() {
+        return;
+    }
+    let photos = colmap("without-points", 3.0);
+    let psnr = |name: &str| metrics(&run(name, &photos)).images.held_out.unwrap().psnr_db.unwrap();
+    let with = psnr("of-points");
+    std::fs::remove_file(photos.join("sparse/0/points3D.txt")).unwrap();
+    let without = psnr("of-no-points");
+    assert!(without > with - 1.0, "{without} dB without, {with} dB with points");
+    for index in 0..FRAMES {
+        image::RgbImage::new(WIDTH, HEIGHT).save(photos.join(format!("images/{index:03}.png"))).unwrap();
+    }
+    let blank = finish(run_command(&photos, &scratch().join("of-blank"), &REFINE));
+    blank.refused(&["only 0 points could be triangulated", "without-points", "points3D.bin"]);
+}
+
 /// The recording as nerfstudio's photos with depth in millimetres and masks, which hide a square that is not of the scene.
 fn transforms(name: &str) -> PathBuf {
     let sequence = Sequence::open(recording(), None, None).unwrap();
@@ -161,13 +180,11 @@ fn masked_pixels_are_neither_mapped_nor_measured() {
 }
 
 #[test]
-fn recordings_without_poses_or_without_a_seed_say_so() {
+fn recordings_without_poses_say_so() {
     let out = scratch().join("refused");
     let bare = copy_of_recording("without-truth");
     std::fs::remove_file(bare.join("groundtruth.txt")).unwrap();
     finish(run_command(&bare, &out, &REFINE)).refused(&["without-truth", "no pose within 0.02 s", "--known-poses"]);
-    let mono = finish(run_command(recording(), &out, &[&REFINE[..], &["--sensor", "mono"]].concat()));
-    mono.refused(&["neither depth nor points", "points3D"]);
     assert!(!out.exists(), "nothing was begun");
 }
 
