@@ -35,6 +35,14 @@ pub enum RecordingError {
         /// Colour image of the frame.
         color: PathBuf,
     },
+    /// Frames of several cameras without `replay.known_poses`.
+    #[error(
+        "the photos of {name} have different cameras, and tracking needs one; take the recording's own poses with --known-poses, or select photos of one camera with --frames"
+    )]
+    SeveralCameras {
+        /// Name of the recording.
+        name: String,
+    },
     /// `replay.known_poses` without a pose near any frame.
     #[error(
         "{name} has no pose within {seconds} s of any frame; known poses come from COLMAP's model, transforms.json or the recording's ground truth: leave --known-poses out to track instead"
@@ -44,14 +52,6 @@ pub enum RecordingError {
         name: String,
         /// Largest difference of timestamps, seconds.
         seconds: f64,
-    },
-    /// `replay.known_poses` without depth and without points.
-    #[error(
-        "{name} has neither depth nor points to begin a map from; give COLMAP's model with its points (sparse/0/points3D.bin), or leave --known-poses out"
-    )]
-    NoKnownPoints {
-        /// Name of the recording.
-        name: String,
     },
     /// Images below the SSIM window's size.
     #[error(
@@ -73,7 +73,7 @@ impl Recording {
     ///
     /// # Errors
     /// If the configuration names no recording, the dataset cannot be read, images are too small to be compared, or `replay.known_poses` is
-    /// set and poses, or anything to begin a map from, are missing.
+    /// set and poses are missing.
     pub fn open(mut config: Config) -> Result<Self, RecordingError> {
         config.validate()?;
         let named = config.sequence.as_ref().ok_or(RecordingError::Unnamed)?;
@@ -120,7 +120,7 @@ impl Recording {
         &self.config
     }
 
-    /// Intrinsics at the mapping resolution, without distortion.
+    /// Intrinsics at the mapping resolution, without distortion; the first frame's, where photos have several.
     pub fn map_pinhole(&self) -> Pinhole {
         self.sequence.camera.pinhole.scaled(self.config.map_scale)
     }
@@ -134,8 +134,11 @@ impl Recording {
     /// Checks that tracking can begin a map at the first frame.
     ///
     /// # Errors
-    /// If the sensor is RGB-D and the first frame has no depth.
-    pub fn check_first_depth(&self) -> Result<(), RecordingError> {
+    /// If frames have different cameras, or the sensor is RGB-D and the first frame has no depth.
+    pub fn check_trackable(&self) -> Result<(), RecordingError> {
+        if !self.sequence.has_one_camera() {
+            return Err(RecordingError::SeveralCameras { name: self.sequence.name.clone() });
+        }
         match self.sequence.entries.first() {
             Some(first) if self.sequence.sensor == Sensor::Rgbd && first.depth.is_none() => {
                 Err(RecordingError::NoFirstDepth { color: first.color.clone() })
@@ -145,16 +148,18 @@ impl Recording {
     }
 
     fn check_size(&self) -> Result<(), RecordingError> {
-        let (Pinhole { width, height, .. }, least) = (self.map_pinhole(), SSIM_WINDOW as u32);
-        if width.min(height) < least { Err(RecordingError::TooSmall { width, height, least }) } else { Ok(()) }
+        let least = SSIM_WINDOW as u32;
+        let cameras = (0..self.sequence.entries.len()).map(|index| self.sequence.camera_of(index));
+        let too_small = cameras
+            .map(|camera| camera.pinhole.scaled(self.config.map_scale))
+            .find(|Pinhole { width, height, .. }| *width.min(height) < least);
+        too_small.map_or(Ok(()), |Pinhole { width, height, .. }| Err(RecordingError::TooSmall { width, height, least }))
     }
 
     fn check_known_poses(&self) -> Result<(), RecordingError> {
-        let name = || self.sequence.name.clone();
-        if !self.sequence.entries.iter().any(|entry| self.known_pose(entry.timestamp_s).is_some()) {
-            return Err(RecordingError::NoKnownPoses { name: name(), seconds: MAX_TIME_DIFFERENCE_S });
+        if self.sequence.entries.iter().any(|entry| self.known_pose(entry.timestamp_s).is_some()) {
+            return Ok(());
         }
-        let begins = self.sequence.sensor == Sensor::Rgbd || !self.sequence.points.is_empty();
-        if begins { Ok(()) } else { Err(RecordingError::NoKnownPoints { name: name() }) }
+        Err(RecordingError::NoKnownPoses { name: self.sequence.name.clone(), seconds: MAX_TIME_DIFFERENCE_S })
     }
 }

@@ -273,5 +273,5 @@ impl Session {
 
 /// Checks that tracking can begin a map at the first frame.
 fn check_first_frame(recording: &Recording) -> Result<(), RecordingError> {
-    if recording.config().replay.known_poses { Ok(()) } else { recording.check_first_depth() }
+    if recording.config().replay.known_poses { Ok(()) } else { recording.check_trackable() }
 }

@@ -206,8 +206,9 @@ impl RecordedView {
         let middle =
             keyframes.poses.get(keyframes.poses.len() / 2).ok_or_else(|| miette!("{} has no keyframes", dir.display()))?;
         let frame = sequence.entries.partition_point(|e| e.timestamp_s < middle.timestamp_s - 1e-4);
-        let rectifier = Rectifier::new(&sequence.camera, config.map_scale);
-        let image = rectifier.rectify(&sequence.load(frame.min(sequence.entries.len() - 1)).into_diagnostic()?);
+        let frame = frame.min(sequence.entries.len() - 1);
+        let rectifier = Rectifier::new(sequence.camera_of(frame), config.map_scale);
+        let image = rectifier.rectify(&sequence.load(frame).into_diagnostic()?);
         let (map, format) = outputs::find_map(dir).ok_or_else(|| miette!("{} has no map", dir.display()))?;
         let cloud = format.read(&map).into_diagnostic()?;
         Ok(Self { cloud, world_from_camera: middle.world_from_camera, image })

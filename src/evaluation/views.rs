@@ -16,7 +16,7 @@ use super::metrics::{ImageMeans, ImageProtocols};
 use crate::geometry::Se3;
 use crate::gpu::{Gpu, GpuError};
 use crate::render::{GpuCloud, Rasterizer, Rendered};
-use crate::sequence::{RectifiedImage, Rectifier, Sequence};
+use crate::sequence::{RectifiedImage, Rectifier, Rectifiers, Sequence};
 use crate::splat::GaussianCloud;
 use crate::splat::ViewCamera;
 
@@ -128,7 +128,7 @@ pub struct ViewSource<'a> {
     pub cloud: &'a GaussianCloud,
 }
 
-/// Compares all posed views with their renders. Frames that cannot be read are left out. `on_held_out` receives each held-out view, `on_view`
+/// Compares all posed views with their renders. Frames that cannot be read or are masked wholly are left out. `on_held_out` receives each held-out view, `on_view`
 /// the number of views done.
 ///
 /// # Errors
@@ -140,7 +140,7 @@ pub fn evaluate_views(
     on_view: &dyn Fn(usize),
 ) -> Result<ImageProtocols, GpuError> {
     let ViewSource { sequence, map_scale, gpu, cloud } = source;
-    let rectifier = Rectifier::new(&sequence.camera, map_scale);
+    let mut rectifiers = Rectifiers::new(map_scale);
     let mut rasterizer = Rasterizer::new(gpu.clone())?;
     let mut on_gpu = GpuCloud::new(gpu, cloud.sh_degree, cloud.len())?;
     on_gpu.append(gpu, cloud)?;
@@ -149,8 +149,12 @@ pub fn evaluate_views(
         on_view(batch * BATCH);
         let indices: Vec<usize> = poses.iter().map(|(index, _)| *index).collect();
         let frames = sequence.load_all(&indices);
-        let recorded: Vec<Option<RectifiedImage>> =
-            frames.into_par_iter().map(|frame| Some(rectifier.rectify(&frame.ok()?))).collect();
+        let rectifiers: Vec<Arc<Rectifier>> = indices.iter().map(|index| rectifiers.of(sequence.camera_of(*index))).collect();
+        let recorded: Vec<Option<RectifiedImage>> = rectifiers
+            .par_iter()
+            .zip(frames)
+            .map(|(rectifier, frame)| Some(rectifier.rectify(&frame.ok()?)).filter(shows_anything))
+            .collect();
         let mut views = Vec::new();
         for ((index, world_from_camera), recorded) in poses.iter().zip(recorded) {
             let Some(recorded) = recorded else { continue };
@@ -176,6 +180,10 @@ pub fn evaluate_views(
         }
     }
     Ok(means.figures())
+}
+
+fn shows_anything(image: &RectifiedImage) -> bool {
+    image.valid.as_ref().is_none_or(|valid| valid.contains(&true))
 }
 
 fn compare(rendered: &Rendered, recorded: &RectifiedImage) -> ViewFigures {

@@ -290,14 +290,15 @@ impl Mapper {
 
     /// How many Gaussians there may be, at present, when there is to be room for one more keyframe's image.
     fn most_gaussians(&self) -> usize {
-        let next_image = self.keyframes.last().map_or(0, MappedKeyframe::image_bytes);
+        let next_image = self.keyframes.iter().map(MappedKeyframe::image_bytes).max().unwrap_or(0);
         let other = LimitsConfig::other_bytes(self.gpu.bytes() + next_image, self.cloud.bytes(), self.cloud.capacity());
         self.config.limits.gaussians(self.cloud.bytes_each(), other)
     }
 
     /// Images beyond their number leave the GPU.
     fn limit_gpu_images(&mut self) -> Result<(), MappingError> {
-        let most = self.keyframes.last().map_or(usize::MAX, |k| self.config.limits.gpu_images(k.image_bytes()));
+        let largest = self.keyframes.iter().map(MappedKeyframe::image_bytes).max().unwrap_or(0);
+        let most = self.config.limits.gpu_images(largest);
         let mut resident = self.keyframes.iter().filter(|k| k.is_resident()).count();
         while resident > most
             && let Some(k) = limits::least_needed_keyframe(&self.keyframes, self.config.window.recent)

@@ -18,8 +18,8 @@ pub(super) fn tiles((width, height): (u32, u32)) -> usize {
     (width.div_ceil(TILE_WIDTH) * height.div_ceil(TILE_HEIGHT)) as usize
 }
 
-/// Sizes of view that the optimiser keeps buffers for: whole and half.
-const SIZES_KEPT: usize = 2;
+/// Sizes of view that the optimiser keeps buffers for: whole and half, of upright and of level photos. Photos may have any number of sizes.
+const SIZES_KEPT: usize = 4;
 
 /// What the loss needs of a view's size. The partials' borders stay zero, so another size cannot share them.
 #[derive(Debug)]

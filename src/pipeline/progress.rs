@@ -47,6 +47,16 @@ pub enum PipelineError {
         /// Error of the first one.
         first: String,
     },
+    /// Known poses without depth and points, of frames that do not give points.
+    #[error(
+        "only {points} points could be triangulated from the frames of {name}; check that its poses are right, that its photos overlap and have texture, or give points (COLMAP's sparse/0/points3D.bin) or depth"
+    )]
+    NoStructure {
+        /// Name of the recording.
+        name: String,
+        /// Points found.
+        points: usize,
+    },
     /// A resumed run was stopped before it reached its checkpoint.
     #[error("the run ended before it had caught up with {checkpoint}, which is kept; resume it again")]
     NotCaughtUp {

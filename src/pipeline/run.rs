@@ -6,7 +6,7 @@ use std::time::Instant;
 
 use crossbeam::channel::bounded;
 
-use super::known_poses;
+use super::known_poses::{self, Scene};
 use super::map_thread::{MapSummary, MapThread};
 use super::pose_feedback;
 use super::progress::guarded;
@@ -52,7 +52,8 @@ pub fn run(
     let waiting = real_time.then(|| frames.clone());
     let (message_sender, messages) = bounded(MESSAGES_AHEAD);
     let (feedback_sender, feedback) = pose_feedback::channel(config);
-    let mapping = &known_poses::mapping_config(recording);
+    let scene = &config.replay.known_poses.then(|| Scene::new(recording, progress)).transpose()?;
+    let mapping = &scene.as_ref().map_or_else(|| config.mapping.clone(), |scene| scene.in_units(&config.mapping));
     let (read, track, map) = std::thread::scope(|scope| {
         let spawn_error = |thread| move |source| PipelineError::Spawn { thread, source };
         // A thread that cannot start drops its end of the channels, and the others end with it.
@@ -68,7 +69,7 @@ pub fn run(
             .name("tracking".into())
             .spawn_scoped(scope, move || {
                 let thread = TrackThread { recording, frames: &frames, mapper: &message_sender, progress };
-                if config.replay.known_poses { known_poses::follow(&thread) } else { thread.track(feedback) }
+                scene.as_ref().map_or_else(|| thread.track(feedback), |scene| known_poses::follow(&thread, scene))
             })
             .map_err(spawn_error("tracking"))?;
         let read = Builder::new()

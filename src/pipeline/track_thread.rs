@@ -162,7 +162,8 @@ impl TrackThread<'_> {
     }
 }
 
-fn right_image(rectifier: &Rectifier, sensor: Sensor, frame: &Frame) -> Option<RightImage> {
+/// The right image of a stereo frame, at the mapping resolution.
+pub(super) fn right_image(rectifier: &Rectifier, sensor: Sensor, frame: &Frame) -> Option<RightImage> {
     match (sensor, &frame.right) {
         (Sensor::Stereo { baseline_metres }, Some(right)) => {
             Some(RightImage { gray: rectifier.rectify_right(right), baseline_metres })

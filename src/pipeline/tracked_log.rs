@@ -6,11 +6,12 @@ use std::time::{Duration, Instant};
 
 use crossbeam::channel::{bounded, unbounded};
 
+use super::known_poses::{self, Scene};
 use super::map_thread::{MapSummary, MapThread, Round};
 use super::pose_feedback::{PoseFeedbackReceiver, PoseFeedbackSender};
 use super::run::FRAMES_AHEAD;
 use super::track_thread::TrackThread;
-use super::{PipelineError, Progress, known_poses, read_thread};
+use super::{PipelineError, Progress, read_thread};
 use crate::evaluation::Exposures;
 use crate::geometry::Se3;
 use crate::gpu::Gpu;
@@ -23,7 +24,8 @@ use crate::tracking::KeyframePose;
 /// Messages of a tracked recording.
 #[derive(Debug)]
 pub struct TrackedLog<'a> {
-    recording: &'a Recording,
+    /// Where poses are known.
+    scene: Option<Scene<'a>>,
     /// In the order in which deterministic replay sends them.
     messages: Vec<MapperMessage>,
     poses: Vec<(usize, Se3)>,
@@ -49,6 +51,7 @@ impl<'a> TrackedLog<'a> {
     /// # Errors
     /// The error that ended tracking early.
     pub fn record(recording: &'a Recording, progress: &Progress) -> Result<Self, PipelineError> {
+        let scene = recording.config().replay.known_poses.then(|| Scene::new(recording, progress)).transpose()?;
         let (frame_sender, frames) = bounded(FRAMES_AHEAD);
         let (message_sender, messages) = unbounded();
         let track = std::thread::scope(|scope| {
@@ -59,16 +62,15 @@ impl<'a> TrackedLog<'a> {
                 .spawn_scoped(scope, move || read_thread::read(recording.sequence(), false, &frame_sender, progress))
                 .map_err(|source| PipelineError::Spawn { thread: "reading", source })?;
             let thread = TrackThread { recording, frames: &frames, mapper: &message_sender, progress };
-            let known_poses = recording.config().replay.known_poses;
-            let feedback = PoseFeedbackReceiver::default();
-            Ok::<_, PipelineError>(if known_poses { known_poses::follow(&thread) } else { thread.track(feedback) })
+            let track = || thread.track(PoseFeedbackReceiver::default());
+            Ok::<_, PipelineError>(scene.as_ref().map_or_else(track, |scene| known_poses::follow(&thread, scene)))
         })?;
         drop(message_sender);
         if let Some(error) = track.error {
             return Err(error);
         }
         let poses = track.trajectory.iter().map(|(index, pose)| (*index, pose.world_from_camera)).collect();
-        Ok(Self { recording, messages: messages.into_iter().collect(), poses, keyframes: track.keyframes })
+        Ok(Self { scene, messages: messages.into_iter().collect(), poses, keyframes: track.keyframes })
     }
 
     /// Frame index and `world_from_camera` of every tracked frame.
@@ -98,7 +100,7 @@ impl<'a> TrackedLog<'a> {
             on_round(MappedLog { cloud: round.cloud.clone(), exposures: Exposures::default(), wall_s, steps: round.steps });
             paused += reached.elapsed();
         };
-        let config = &known_poses::mapping_config_in_units(self.recording, config);
+        let config = &self.scene.as_ref().map_or_else(|| config.clone(), |scene| scene.in_units(config));
         let (messages, feedback) = (&messages, &PoseFeedbackSender::default());
         let summary = MapThread { gpu, config, messages, frames: None, feedback, progress }.map(&mut on_round, None);
         let MapSummary { cloud, keyframes, step_ms, error, .. } = summary;

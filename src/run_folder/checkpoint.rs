@@ -165,7 +165,8 @@ impl Identity {
     pub fn of(recording: &Recording, gpu: &Gpu) -> Self {
         let (sequence, config) = (recording.sequence(), recording.config());
         let times: Vec<f64> = sequence.entries.iter().map(|entry| entry.timestamp_s).collect();
-        let frames = format!("{:?} {:?} {times:?}", sequence.camera, sequence.sensor);
+        let own_cameras: Vec<_> = sequence.entries.iter().map(|entry| entry.camera).collect();
+        let frames = format!("{:?} {own_cameras:?} {:?} {times:?}", sequence.camera, sequence.sensor);
         Self {
             config: config.to_toml(),
             adapter: outputs::adapter(gpu).to_string(),

@@ -28,6 +28,7 @@ impl MessageDigest {
                 let image = &keyframe.image;
                 digest.update(plain(&(keyframe.id, keyframe.world_from_camera, &keyframe.covisible, image.pinhole)));
                 digest.update(image.color.as_raw());
+                image.valid.iter().for_each(|valid| digest.update(bytemuck::cast_slice::<bool, u8>(valid)));
                 image.depth.iter().for_each(|depth| digest.update(bytemuck::cast_slice(&depth.metres)));
             }
         }

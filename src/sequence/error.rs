@@ -80,6 +80,20 @@ pub enum SequenceError {
         /// The image that does not exist.
         image: PathBuf,
     },
+    /// Most images of a list do not exist.
+    #[error(
+        "{list}: {missing} of {listed} listed images are missing, among them {example}; check that the recording was copied whole"
+    )]
+    MissingImages {
+        /// The list.
+        list: PathBuf,
+        /// Listed images that do not exist.
+        missing: usize,
+        /// Listed images.
+        listed: usize,
+        /// The first missing image, as it is listed.
+        example: String,
+    },
     /// The recording comes without a calibration.
     #[error("{folder}: no camera.txt, and the folder's name says no known camera ({known}); add camera.txt with `fx fy cx cy width height depth_units_per_metre k1 k2 p1 p2`, or name one with --camera", known = cameras::names().join(", "))]
     NoCamera {

@@ -15,7 +15,7 @@ use std::sync::Arc;
 
 use image::{GrayImage, RgbImage};
 use layouts::{LayoutRow, Video};
-use nalgebra::Vector3;
+use nalgebra::{Vector2, Vector3};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
@@ -23,9 +23,9 @@ use crate::geometry::{Camera, Trajectory};
 
 pub use cameras::is_file as is_camera_file;
 pub use error::SequenceError;
-use files::{decode, files_in, folder_name, images_in, parse_json, read_text};
+use files::{decode, existing, files_in, folder_name, images_in, parse_json, read_text};
 pub use layouts::Layout;
-pub use rectify::{RectifiedImage, Rectifier};
+pub use rectify::{RectifiedImage, Rectifier, Rectifiers};
 use stereo::StereoRemap;
 
 /// Sensor of a recording: the images of a frame.
@@ -107,10 +107,23 @@ pub struct Frame {
     pub depth: Option<DepthImage>,
     /// The right camera's image, same size, row-aligned with `color`.
     pub right: Option<GrayImage>,
+    /// Same size as `color`; pixels of value 0 are to be ignored.
+    pub mask: Option<GrayImage>,
+}
+
+impl Frame {
+    /// Whether the mask keeps the recorded pixel nearest to `pixel`. Without a mask, all are kept.
+    pub fn keeps(&self, pixel: &Vector2<f64>) -> bool {
+        let kept = |mask: &GrayImage| {
+            let value = mask.get_pixel_checked(pixel.x.round() as u32, pixel.y.round() as u32);
+            value.is_some_and(|value| value.0[0] > 0)
+        };
+        self.mask.as_ref().is_none_or(kept)
+    }
 }
 
 /// Where one frame lies on disk.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct FrameEntry {
     /// Seconds, by the clock of the recording.
     pub timestamp_s: f64,
@@ -120,6 +133,10 @@ pub struct FrameEntry {
     pub depth: Option<PathBuf>,
     /// The right image of a stereo pair.
     pub right: Option<PathBuf>,
+    /// Image whose pixels of value 0 are to be ignored.
+    pub mask: Option<PathBuf>,
+    /// The frame's camera where it is not that of the sequence.
+    pub camera: Option<Camera>,
 }
 
 /// A point of the scene that came with the recording.
@@ -138,7 +155,7 @@ pub struct Sequence {
     pub name: String,
     /// Dataset layout.
     pub layout: Layout,
-    /// The colour camera; the left one of a stereo pair.
+    /// The colour camera; the left one of a stereo pair. The first frame's, where photos have several: see [`Self::camera_of`].
     pub camera: Camera,
     /// Images of a frame.
     pub sensor: Sensor,
@@ -176,9 +193,9 @@ impl Sequence {
         layout.open(folder, camera)
     }
 
-    /// A recording without truth and known points.
+    /// A recording without truth and known points. Frames that bring no camera have `camera`.
     fn new(name: String, layout: &'static LayoutRow, camera: Camera, sensor: Sensor, entries: Vec<FrameEntry>) -> Self {
-        Self {
+        let mut sequence = Self {
             name,
             layout: Layout::of(layout),
             camera,
@@ -188,7 +205,28 @@ impl Sequence {
             points: Vec::new(),
             remap: None,
             video: None,
+        };
+        sequence.share_camera();
+        sequence
+    }
+
+    /// Makes the first frame's camera that of the sequence; frames of another camera keep theirs.
+    fn share_camera(&mut self) {
+        let before = self.camera;
+        self.camera = self.entries.first().and_then(|entry| entry.camera).unwrap_or(before);
+        for entry in &mut self.entries {
+            entry.camera = Some(entry.camera.unwrap_or(before)).filter(|camera| *camera != self.camera);
         }
+    }
+
+    /// The camera of frame `index`.
+    pub fn camera_of(&self, index: usize) -> &Camera {
+        self.entries[index].camera.as_ref().unwrap_or(&self.camera)
+    }
+
+    /// Whether all frames have one camera.
+    pub fn has_one_camera(&self) -> bool {
+        self.entries.iter().all(|entry| entry.camera.is_none())
     }
 
     /// Takes from the recording only what a sensor of this kind gives: a monocular replay of an RGB-D recording leaves its depth out.
@@ -221,6 +259,7 @@ impl Sequence {
         }
         let end = range.end.min(len);
         self.entries = self.entries[range.start..end].iter().step_by(every.max(1)).cloned().collect();
+        self.share_camera();
         Ok(())
     }
 
@@ -237,45 +276,28 @@ impl Sequence {
     /// # Errors
     /// [`SequenceError`] if an image is missing, damaged, or not of the camera's size.
     pub fn load(&self, index: usize) -> Result<Frame, SequenceError> {
-        let entry = &self.entries[index];
+        let (entry, camera) = (&self.entries[index], self.camera_of(index));
         let color = match &self.video {
             Some(video) => video.load(entry.timestamp_s)?.into(),
             None => decode(&entry.color)?,
         };
-        self.check_size(&entry.color, (color.width(), color.height()))?;
+        check_size(camera, &entry.color, (color.width(), color.height()))?;
         let color = match &self.remap {
             Some(remap) => remap.left(color),
             None => color.into_rgb8(),
         };
-        let depth = entry.depth.as_deref().map(|path| self.load_depth(path)).transpose()?;
+        let depth = entry.depth.as_deref().map(|path| load_depth(camera, path)).transpose()?;
         let right = entry.right.as_deref().map(|path| self.load_right(path)).transpose()?;
-        Ok(Frame { index, timestamp_s: entry.timestamp_s, color, depth, right })
+        let mask = entry.mask.as_deref().map(|path| load_mask(camera, path)).transpose()?;
+        Ok(Frame { index, timestamp_s: entry.timestamp_s, color, depth, right, mask })
     }
 
     fn load_right(&self, path: &Path) -> Result<GrayImage, SequenceError> {
         let image = decode(path)?.into_luma8();
-        self.check_size(path, image.dimensions())?;
+        check_size(&self.camera, path, image.dimensions())?;
         Ok(match &self.remap {
             Some(remap) => remap.right(&image),
             None => image,
-        })
-    }
-
-    fn load_depth(&self, path: &Path) -> Result<DepthImage, SequenceError> {
-        let image::DynamicImage::ImageLuma16(raw) = decode(path)? else {
-            return Err(SequenceError::DepthFormat { path: path.into() });
-        };
-        self.check_size(path, raw.dimensions())?;
-        let metres_per_unit = (1.0 / self.camera.depth_units_per_metre) as f32;
-        let (width, height) = raw.dimensions();
-        Ok(DepthImage {
-            width,
-            height,
-            metres: raw
-                .into_raw()
-                .into_iter()
-                .map(|units| if units == NOT_MEASURED { 0.0 } else { f32::from(units) * metres_per_unit })
-                .collect(),
         })
     }
 
@@ -286,18 +308,46 @@ impl Sequence {
         for path in paths.flatten() {
             // A first frame that cannot be read at all is met again, and counted, when it is loaded.
             if let Ok(size) = image::image_dimensions(path) {
-                self.check_size(path, size)?;
+                check_size(&self.camera, path, size)?;
             }
         }
         Ok(())
     }
 
-    fn check_size(&self, path: &Path, (found_width, found_height): (u32, u32)) -> Result<(), SequenceError> {
-        let (width, height) = (self.camera.pinhole.width, self.camera.pinhole.height);
-        if (found_width, found_height) == (width, height) {
-            Ok(())
-        } else {
-            Err(SequenceError::Size { path: path.into(), width, height, found_width, found_height })
+    /// Compares all masks and depth images with their cameras.
+    fn check_mask_and_depth_sizes(&self) -> Result<(), SequenceError> {
+        for (index, entry) in self.entries.iter().enumerate() {
+            for path in [&entry.mask, &entry.depth].into_iter().flatten() {
+                let size = image::image_dimensions(path).map_err(|source| SequenceError::Image { path: path.clone(), source })?;
+                check_size(self.camera_of(index), path, size)?;
+            }
         }
+        Ok(())
+    }
+}
+
+fn load_mask(camera: &Camera, path: &Path) -> Result<GrayImage, SequenceError> {
+    let mask = decode(path)?.into_luma8();
+    check_size(camera, path, mask.dimensions())?;
+    Ok(mask)
+}
+
+fn load_depth(camera: &Camera, path: &Path) -> Result<DepthImage, SequenceError> {
+    let image::DynamicImage::ImageLuma16(raw) = decode(path)? else {
+        return Err(SequenceError::DepthFormat { path: path.into() });
+    };
+    check_size(camera, path, raw.dimensions())?;
+    let metres_per_unit = (1.0 / camera.depth_units_per_metre) as f32;
+    let (width, height) = raw.dimensions();
+    let metres = |units| if units == NOT_MEASURED { 0.0 } else { f32::from(units) * metres_per_unit };
+    Ok(DepthImage { width, height, metres: raw.into_raw().into_iter().map(metres).collect() })
+}
+
+fn check_size(camera: &Camera, path: &Path, (found_width, found_height): (u32, u32)) -> Result<(), SequenceError> {
+    let (width, height) = (camera.pinhole.width, camera.pinhole.height);
+    if (found_width, found_height) == (width, height) {
+        Ok(())
+    } else {
+        Err(SequenceError::Size { path: path.into(), width, height, found_width, found_height })
     }
 }

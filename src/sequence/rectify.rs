@@ -20,7 +20,7 @@ pub struct RectifiedImage {
     pub color: RgbImage,
     /// Depth of the same pixels, where the sensor has it.
     pub depth: Option<DepthImage>,
-    /// `[height * width]`, row-major: whether the camera recorded the pixel. `None`: all of them.
+    /// `[height * width]`, row-major: whether the camera recorded the pixel and the mask keeps it. `None`: all of them.
     pub valid: Option<Arc<[bool]>>,
 }
 
@@ -96,20 +96,32 @@ impl Rectifier {
     }
 
     /// Resamples colour (box filter over bilinear samples; the border repeats) and depth (mean over the nearest surface; 0 at pixels that
-    /// are not valid).
+    /// are not valid). Pixels that the mask does not keep are not valid.
     pub fn rectify(&self, frame: &Frame) -> RectifiedImage {
         let mut color = RgbImage::new(self.pinhole.width, self.pinhole.height);
         let group = self.samples * self.samples;
         for (pixel, sources) in color.pixels_mut().zip(self.sources.chunks_exact(group)) {
             *pixel = Rgb(box_filter(&frame.color, sources));
         }
-        let mut image = RectifiedImage { pinhole: self.pinhole, color, depth: None, valid: self.valid.clone() };
+        let valid = frame.mask.as_ref().map_or_else(|| self.valid.clone(), |mask| self.valid_and_kept(mask));
+        let mut image = RectifiedImage { pinhole: self.pinhole, color, depth: None, valid };
         image.depth = frame.depth.as_ref().map(|depth| {
             let at = |(i, sources): (usize, _)| if image.is_valid(i) { nearest_surface(depth, sources) } else { 0.0 };
             let metres = self.sources.chunks_exact(group).enumerate().map(at).collect();
             DepthImage { width: self.pinhole.width, height: self.pinhole.height, metres }
         });
         image
+    }
+
+    /// The valid pixels all of whose recorded pixels the mask keeps; `None`: all.
+    fn valid_and_kept(&self, mask: &GrayImage) -> Option<Arc<[bool]>> {
+        let (right, bottom) = (mask.width() as f32 - 1.0, mask.height() as f32 - 1.0);
+        let kept =
+            |[x, y]: &[f32; 2]| mask.get_pixel(x.round().clamp(0.0, right) as u32, y.round().clamp(0.0, bottom) as u32).0[0] > 0;
+        let groups = self.sources.chunks_exact(self.samples * self.samples).enumerate();
+        let valid: Arc<[bool]> =
+            groups.map(|(i, sources)| self.valid.as_ref().is_none_or(|valid| valid[i]) && sources.iter().all(kept)).collect();
+        valid.contains(&false).then_some(valid)
     }
 
     /// The right image of a pair, whose camera is like the left one.
@@ -132,6 +144,34 @@ impl Rectifier {
             }
         }
         DepthImage { width, height, metres }
+    }
+}
+
+/// Rectifiers that are kept: a table has megabytes, and each photo may have a camera of its own.
+const RECTIFIERS_KEPT: usize = 4;
+
+/// Rectifiers of several cameras, made when they are needed; the last few are kept.
+#[derive(Debug)]
+pub struct Rectifiers {
+    scale: f64,
+    /// The last one used first.
+    kept: Vec<(Camera, Arc<Rectifier>)>,
+}
+
+impl Rectifiers {
+    /// Of images `scale` times the recorded size, as in [`Rectifier::new`].
+    pub fn new(scale: f64) -> Self {
+        Self { scale, kept: Vec::new() }
+    }
+
+    /// The rectifier of a camera.
+    pub fn of(&mut self, camera: &Camera) -> Arc<Rectifier> {
+        let place = self.kept.iter().position(|(of, _)| of == camera);
+        let found = place.map(|place| self.kept.remove(place));
+        let (of, rectifier) = found.unwrap_or_else(|| (*camera, Arc::new(Rectifier::new(camera, self.scale))));
+        self.kept.insert(0, (of, rectifier.clone()));
+        self.kept.truncate(RECTIFIERS_KEPT);
+        rectifier
     }
 }
 
@@ -186,7 +226,8 @@ mod tests {
     fn frame(depth: impl Fn(u32, u32) -> f32) -> Frame {
         let metres = (0..64 * 48).map(|i| depth(i % 64, i / 64)).collect();
         let color = RgbImage::from_fn(64, 48, |x, y| Rgb([x as u8 * 2, y as u8 * 2, 7]));
-        Frame { index: 0, timestamp_s: 0.0, color, depth: Some(DepthImage { width: 64, height: 48, metres }), right: None }
+        let depth = Some(DepthImage { width: 64, height: 48, metres });
+        Frame { index: 0, timestamp_s: 0.0, color, depth, right: None, mask: None }
     }
 
     #[test]
@@ -224,6 +265,39 @@ mod tests {
         assert_eq!(valid(-0.2, 0.5), [true; 4]);
         assert_eq!(valid(-1.5, 1.0), [false, false, true, true]);
         assert!(Rectifier::new(&camera(Distortion::default()), 0.3).valid.is_none());
+    }
+
+    #[test]
+    fn rectifiers_of_the_last_few_cameras_are_kept() {
+        let cameras: Vec<Camera> =
+            (0..8).map(|i| camera(Distortion { k1: 0.01 * f64::from(i), ..Distortion::default() })).collect();
+        let mut rectifiers = Rectifiers::new(0.5);
+        let first = rectifiers.of(&cameras[0]);
+        assert!(cameras[1..4].iter().all(|camera| !Arc::ptr_eq(&first, &rectifiers.of(camera))));
+        assert!(Arc::ptr_eq(&first, &rectifiers.of(&cameras[0])));
+        cameras[4..].iter().for_each(|camera| drop(rectifiers.of(camera)));
+        assert!(!Arc::ptr_eq(&first, &rectifiers.of(&cameras[0])), "it was let go");
+        assert_eq!((rectifiers.kept.len(), Arc::strong_count(&first)), (RECTIFIERS_KEPT, 1));
+    }
+
+    /// A mapping pixel with one masked pixel below it is not valid, and has no depth.
+    #[test]
+    fn masked_pixels_are_not_valid() {
+        let mask = GrayImage::from_fn(64, 48, |x, y| image::Luma([u8::from((x, y) != (10, 21))]));
+        let masked = Frame { mask: Some(mask), ..frame(|_, _| 1.0) };
+        let invalid = |k1: f64, scale: f64| {
+            let image = Rectifier::new(&camera(Distortion { k1, ..Distortion::default() }), scale).rectify(&masked);
+            let invalid = (0..image.color.width() * image.color.height()).filter(|&i| !image.is_valid(i as usize));
+            let places: Vec<(u32, u32)> = invalid.map(|i| (i % image.color.width(), i / image.color.width())).collect();
+            assert!(places.iter().all(|(x, y)| image.depth.as_ref().unwrap().at(*x, *y).is_none()));
+            places
+        };
+        assert_eq!(invalid(0.0, 1.0), [(10, 21)]);
+        assert_eq!(invalid(0.0, 0.5), [(5, 10)]);
+        assert!(invalid(0.2, 1.0).contains(&(0, 0)), "what the camera did not record stays invalid");
+        let all = Frame { mask: Some(GrayImage::from_pixel(64, 48, image::Luma([255]))), ..masked.clone() };
+        assert!(Rectifier::new(&camera(Distortion::default()), 0.5).rectify(&all).valid.is_none());
+        assert!(!masked.keeps(&Vector2::new(10.4, 20.6)) && masked.keeps(&Vector2::new(10.6, 20.6)));
     }
 
     #[test]

@@ -17,6 +17,7 @@ mod loop_closing;
 pub(crate) mod map;
 mod rig;
 pub(crate) mod solvers;
+pub(crate) mod structure;
 mod tracker;
 
 pub use config::TrackingConfig;

@@ -3,8 +3,10 @@
 use std::path::{Path, PathBuf};
 
 use crate::common::recording::{
-    FRAMES, copy_of_recording, finish, metrics, recording, run_command, scratch, skipped_without_adapter, stamps,
+    FRAMES, HEIGHT, WIDTH, copy_of_recording, finish, metrics, recording, run_command, scratch, skipped_without_adapter, stamps,
 };
+use image::imageops::{FilterType, resize};
+use image::{GrayImage, ImageBuffer, Luma, Rgb};
 use keysplat::sequence::Sequence;
 use nalgebra::Vector2;
 
@@ -83,14 +85,106 @@ fn photos_are_mapped_from_points_whatever_their_unit() {
     assert!(psnr[0] > 24.0 && (psnr[0] - psnr[1]).abs() < 1.0, "{psnr:?}");
 }
 
+/// The photos of [`colmap`], every second one at half its size with a camera of its own.
 #[test]
-fn recordings_without_poses_or_without_a_seed_say_so() {
+fn photos_of_several_cameras_are_mapped_and_not_tracked() {
+    let photos = colmap("cameras", 1.0);
+    let model = photos.join("sparse/0");
+    let p = Sequence::open(recording(), None, None).unwrap().camera.pinhole.scaled(0.5);
+    let mut cameras = std::fs::read_to_string(model.join("cameras.txt")).unwrap();
+    cameras += &format!("2 PINHOLE {} {} {} {} {} {}\n", p.width, p.height, p.fx, p.fy, p.cx + 0.5, p.cy + 0.5);
+    let mut images = std::fs::read_to_string(model.join("images.txt")).unwrap();
+    for index in (1..FRAMES).step_by(2) {
+        let photo = photos.join(format!("images/{index:03}.png"));
+        let half = resize(&image::open(&photo).unwrap().into_rgb8(), p.width, p.height, FilterType::Triangle);
+        half.save(photo).unwrap();
+        images = images.replace(&format!(" 1 {index:03}.png"), &format!(" 2 {index:03}.png"));
+    }
+    std::fs::write(model.join("cameras.txt"), cameras).unwrap();
+    std::fs::write(model.join("images.txt"), images).unwrap();
+    let tracked = finish(run_command(&photos, &scratch().join("not-tracked"), &[]));
+    tracked.refused(&["different cameras", "--known-poses"]);
+    if skipped_without_adapter() {
+        return;
+    }
+    let m = metrics(&run("of-cameras", &photos));
+    assert_eq!((m.keyframes, m.frames_tracked), (Some(FRAMES as u64 - 3), FRAMES as u64), "{m}");
+    assert!(m.images.all_frames.unwrap().psnr_db.unwrap() > 22.0, "{m}");
+}
+
+/// Points of the photos themselves do as well as those of the model.
+#[test]
+fn a_scene_without_points_begins_from_its_photos() {
+    if skipped_without_adapter() {
+        return;
+    }
+    let photos = colmap("without-points", 3.0);
+    let psnr = |name: &str| metrics(&run(name, &photos)).images.held_out.unwrap().psnr_db.unwrap();
+    let with = psnr("of-points");
+    std::fs::remove_file(photos.join("sparse/0/points3D.txt")).unwrap();
+    let without = psnr("of-no-points");
+    assert!(without > with - 1.0, "{without} dB without, {with} dB with points");
+    for index in 0..FRAMES {
+        image::RgbImage::new(WIDTH, HEIGHT).save(photos.join(format!("images/{index:03}.png"))).unwrap();
+    }
+    let blank = finish(run_command(&photos, &scratch().join("of-blank"), &REFINE));
+    blank.refused(&["only 0 points could be triangulated", "without-points", "points3D.bin"]);
+}
+
+/// The recording as nerfstudio's photos with depth in millimetres and masks, which hide a square that is not of the scene.
+fn transforms(name: &str) -> PathBuf {
+    let sequence = Sequence::open(recording(), None, None).unwrap();
+    let folder = scratch().join(name);
+    ["images", "depth", "masks"].iter().for_each(|part| std::fs::create_dir_all(folder.join(part)).unwrap());
+    let p = sequence.camera.pinhole;
+    let mut frames = Vec::new();
+    for index in 0..FRAMES {
+        let mut frame = sequence.load(index).unwrap();
+        let hidden = |x: u32, y: u32| (40..80).contains(&x) && (30..70).contains(&y);
+        let white = frame.color.enumerate_pixels_mut().filter(|(x, y, _)| hidden(*x, *y));
+        white.for_each(|(.., pixel)| *pixel = Rgb([255; 3]));
+        let file = |part: &str| folder.join(format!("{part}/{index:03}.png"));
+        frame.color.save(file("images")).unwrap();
+        let depth = frame.depth.unwrap();
+        let millimetres = |x, y| Luma([depth.at(x, y).map_or(0, |metres| (metres * 1000.0).round() as u16)]);
+        ImageBuffer::from_fn(WIDTH, HEIGHT, millimetres).save(file("depth")).unwrap();
+        GrayImage::from_fn(WIDTH, HEIGHT, |x, y| Luma([if hidden(x, y) { 0 } else { 255 }])).save(file("masks")).unwrap();
+        let mut pose = sequence.groundtruth.as_ref().unwrap().poses[index].world_from_camera.to_matrix();
+        // OpenGL's camera looks along -z, with y up.
+        pose.columns_mut(1, 2).neg_mut();
+        let rows: Vec<Vec<f64>> = pose.row_iter().map(|row| row.iter().copied().collect()).collect();
+        frames.push(format!(
+            r#"{{ "file_path": "images/{index:03}.png", "mask_path": "masks/{index:03}.png",
+                 "depth_file_path": "depth/{index:03}.png", "transform_matrix": {rows:?} }}"#
+        ));
+    }
+    let lens = format!(r#""fl_x": {}, "fl_y": {}, "cx": {}, "cy": {}"#, p.fx, p.fy, p.cx + 0.5, p.cy + 0.5);
+    let text = format!("{{ {lens}, \"frames\": [{}] }}", frames.join(",\n"));
+    std::fs::write(folder.join("transforms.json"), text).unwrap();
+    folder
+}
+
+#[test]
+fn masked_pixels_are_neither_mapped_nor_measured() {
+    if skipped_without_adapter() {
+        return;
+    }
+    let photos = transforms("masked");
+    let m = metrics(&run("of-masked", &photos));
+    let held_out = m.images.held_out.clone().unwrap();
+    assert!(held_out.psnr_db.unwrap() > 22.0 && held_out.depth_l1_m.unwrap() < 0.1, "{m}");
+    let text = std::fs::read_to_string(photos.join("transforms.json")).unwrap();
+    std::fs::write(photos.join("transforms.json"), text.replace("mask_path", "no_mask_path")).unwrap();
+    let unmasked = metrics(&run("of-unmasked", &photos)).images.held_out.unwrap();
+    assert!(unmasked.psnr_db.unwrap() < held_out.psnr_db.unwrap() - 1.0, "the square moves with the camera: {unmasked:?}");
+}
+
+#[test]
+fn recordings_without_poses_say_so() {
     let out = scratch().join("refused");
     let bare = copy_of_recording("without-truth");
     std::fs::remove_file(bare.join("groundtruth.txt")).unwrap();
     finish(run_command(&bare, &out, &REFINE)).refused(&["without-truth", "no pose within 0.02 s", "--known-poses"]);
-    let mono = finish(run_command(recording(), &out, &[&REFINE[..], &["--sensor", "mono"]].concat()));
-    mono.refused(&["neither depth nor points", "points3D"]);
     assert!(!out.exists(), "nothing was begun");
 }
 

@@ -53,7 +53,7 @@ fn render(index: usize, world_from_camera: &Se3) -> Frame {
         .map(|i| wall(&centre, &ray(f64::from(i % pinhole.width), f64::from(i / pinhole.width))) as f32)
         .collect();
     let depth = Some(DepthImage { width: pinhole.width, height: pinhole.height, metres });
-    Frame { index, timestamp_s: index as f64 / 30.0, color, depth, right: None }
+    Frame { index, timestamp_s: index as f64 / 30.0, color, depth, right: None, mask: None }
 }
 
 /// A smooth walk through the room.

@@ -55,7 +55,7 @@ fn open(folder: &Path) -> Result<Sequence, SequenceError> {
         timestamp_s: seconds(left.timestamp_ns),
         right: nearest(&rights, left.timestamp_ns),
         color: left.path,
-        depth: None,
+        ..FrameEntry::default()
     };
     let entries = lefts.into_iter().map(entry).collect();
     let mut sequence = Sequence::new(folder_name(folder), &LAYOUT, camera, Sensor::Mono, entries);

@@ -127,7 +127,7 @@ fn entries(folder: &Path, other_folder: &Path, sensor: Sensor, fps: f64) -> Resu
     for (index, color) in images_in(folder)?.into_iter().enumerate() {
         let other = others.remove(&stem(&color));
         let (depth, right) = if sensor == Sensor::Rgbd { (other, None) } else { (None, other) };
-        entries.push(FrameEntry { timestamp_s: index as f64 / fps, color, depth, right });
+        entries.push(FrameEntry { timestamp_s: index as f64 / fps, color, depth, right, ..FrameEntry::default() });
     }
     if entries.is_empty() {
         return Err(SequenceError::Empty { path: folder.into() });

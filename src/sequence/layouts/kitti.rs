@@ -67,7 +67,7 @@ fn open(folder: &Path) -> Result<Sequence, SequenceError> {
     let entries: Vec<FrameEntry> = lefts
         .into_iter()
         .zip(&times)
-        .map(|(color, &timestamp_s)| FrameEntry { timestamp_s, right: right_of(&color), color, depth: None })
+        .map(|(color, &timestamp_s)| FrameEntry { timestamp_s, right: right_of(&color), color, ..FrameEntry::default() })
         .collect();
     let groundtruth = truth_file(folder).map(|path| parse_poses(&read_text(&path)?, &path, &times)).transpose()?;
     let camera = Camera { pinhole, distortion: Distortion::default(), depth_units_per_metre: 1.0 };

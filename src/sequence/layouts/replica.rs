@@ -42,7 +42,7 @@ fn open(folder: &Path) -> Result<Sequence, SequenceError> {
         timestamp_s: timestamp_s(*number),
         color: color.clone(),
         depth: depths.get(number).cloned(),
-        right: None,
+        ..FrameEntry::default()
     };
     let entries: Vec<FrameEntry> = colors.iter().map(entry).collect();
     if entries.is_empty() {

@@ -1,11 +1,17 @@
 //! Photos with known poses in a `transforms.json`, as NeRF's data, instant-ngp and nerfstudio have it.
 //!
 //! `frames` lists photos (`file_path`, with or without its extension) and their `transform_matrix`, camera to world, of OpenGL's camera: x
-//! right, y up, z backward; ours has y down, z forward. The lens is `fl_x fl_y cx cy w h k1 k2 k3 p1 p2`, for all frames or the same in
-//! each, or `camera_angle_x` alone. Principal points count from the image's corner, ours from the first pixel's centre. Frames stay in the
-//! order of the file, the n-th has the timestamp of n seconds.
+//! right, y up, z backward; ours has y down, z forward. The lens is `fl_x fl_y cx cy w h k1 k2 k3 p1 p2`, or `camera_angle_x` alone. A
+//! frame's values replace those of the whole file. Principal points count from the image's corner, ours from the first pixel's centre. Frames stay in the
+//! order of the file, the n-th listed one has the timestamp of n seconds. Up to half of the photos may be missing.
 //!
-//! Left out: several cameras and fisheye lenses, which are refused; depth images, masks and point clouds, which are not read.
+//! After nerfstudio, `mask_path` is an image whose black pixels are ignored, and `depth_file_path` a 16-bit image in units of
+//! `depth_unit_scale_factor`, a thousandth of the poses' unit by default. With one depth image the recording is RGB-D; frames without
+//! depth are then as those of a sensor that measured nothing.
+//!
+//! Left out: fisheye lenses, which are refused; point clouds, which are not read.
+
+mod lens;
 
 use std::path::{Path, PathBuf};
 
@@ -13,10 +19,15 @@ use nalgebra::{UnitQuaternion, Vector3};
 use serde::Deserialize;
 
 use super::row::{LayoutRow, SAMPLE_SIZE, parse_text};
-use crate::geometry::{Camera, Distortion, Pinhole, Se3, StampedPose, Trajectory};
-use crate::sequence::{FrameEntry, Sensor, Sequence, SequenceError, checks, folder_name, parse_json, read_text};
+use crate::geometry::{Camera, Se3, StampedPose, Trajectory};
+use crate::sequence::{FrameEntry, Sensor, Sequence, SequenceError, checks, existing, folder_name, parse_json, read_text};
+use lens::Lens;
 
 const FILE: &str = "transforms.json";
+/// The unit of depth images in that of the poses: millimetres where these are metres.
+const DEPTH_UNIT: f64 = 1e-3;
+/// Values of `camera_model` whose lens is OpenCV's.
+const KNOWN_MODELS: [&str; 6] = ["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"];
 /// Endings of photos whose path leaves it out.
 const ENDINGS: [&str; 4] = ["", ".png", ".jpg", ".jpeg"];
 
@@ -31,7 +42,8 @@ pub(super) const LAYOUT: LayoutRow = LayoutRow {
     parse: |bytes| {
         parse_text(bytes, |text, path| {
             let what = |what| SequenceError::Content { path: path.into(), what };
-            vec![Transforms::parse(text, path).and_then(|file| file.lens.camera(SAMPLE_SIZE).map(drop).map_err(what))]
+            let cameras = |file: Transforms| file.photos.iter().try_for_each(|photo| file.camera(photo, SAMPLE_SIZE).map(drop));
+            vec![Transforms::parse(text, path).and_then(|file| cameras(file).map_err(what))]
         })
     },
 };
@@ -43,51 +55,81 @@ fn recognise(folder: &Path) -> bool {
 fn open(folder: &Path) -> Result<Sequence, SequenceError> {
     let path = folder.join(FILE);
     let content = |what: String| SequenceError::Content { path: path.clone(), what };
-    let Transforms { lens, photos } = Transforms::parse(&read_text(&path)?, &path)?;
+    let file = Transforms::parse(&read_text(&path)?, &path)?;
+    let found = file.photos.iter().map(|photo| image_file(folder, &photo.file_path).ok_or_else(|| photo.file_path.clone()));
+    let found = found.enumerate().map(|(index, color)| Ok((index, color?)));
     let (mut entries, mut poses) = (Vec::new(), Vec::new());
-    for (index, (file_path, world_from_camera)) in photos.into_iter().enumerate() {
+    for (index, color) in existing(&path, found.collect())? {
+        let photo = &file.photos[index];
+        let wrong = |what: String| content(format!("frame {index}, {}: {what}", photo.file_path));
+        let beside = |name: &Option<String>| {
+            let missing = |name: &str| wrong(format!("there is no {name}; copy the recording whole, or take its name out"));
+            name.as_deref().map(|name| image_file(folder, name).ok_or_else(|| missing(name))).transpose()
+        };
+        let (mask, depth) = (beside(&photo.mask_path)?, beside(&photo.depth_file_path)?);
+        // A photo that cannot be read is met again, and counted, when it is loaded.
+        let size = if photo.lens.is_sized() { Some((0, 0)) } else { image::image_dimensions(&color).ok() };
+        let camera = size.map(|size| file.camera(photo, size)).transpose().map_err(wrong)?;
         let timestamp_s = index as f64;
-        let color = photo(folder, &file_path).ok_or_else(|| {
-            content(format!("frame {index}, {file_path}: there is no such file; check that the recording was copied whole"))
-        })?;
-        entries.push(FrameEntry { timestamp_s, color, depth: None, right: None });
-        poses.push(StampedPose { timestamp_s, world_from_camera });
+        entries.push(FrameEntry { timestamp_s, color, depth, mask, camera, ..FrameEntry::default() });
+        poses.push(StampedPose { timestamp_s, world_from_camera: photo.world_from_camera });
     }
-    let first = &entries.first().ok_or_else(|| SequenceError::Empty { path: path.clone() })?.color;
-    let size = image::image_dimensions(first).map_err(|source| SequenceError::Image { path: first.clone(), source })?;
-    let camera = lens.camera(size).map_err(content)?;
+    if entries.is_empty() {
+        return Err(SequenceError::Empty { path });
+    }
+    let unreadable = || content("not one of its photos can be read; check that the recording was copied whole".into());
+    let camera = entries.iter().find_map(|entry: &FrameEntry| entry.camera).ok_or_else(unreadable)?;
+    let sensor = if entries.iter().any(|entry| entry.depth.is_some()) { Sensor::Rgbd } else { Sensor::Mono };
     let groundtruth = Some(Trajectory { poses });
-    let name = folder_name(folder);
-    let sequence = Sequence { groundtruth, ..Sequence::new(name, &LAYOUT, camera, Sensor::Mono, entries) };
+    let sequence = Sequence { groundtruth, ..Sequence::new(folder_name(folder), &LAYOUT, camera, sensor, entries) };
     sequence.check_first_size()?;
+    sequence.check_mask_and_depth_sizes()?;
     Ok(sequence)
 }
 
 /// Checked content of the file.
-pub(super) struct Transforms {
-    pub lens: Lens,
-    /// Each photo's path as it is written, and world_from_camera.
-    pub photos: Vec<(String, Se3)>,
+struct Transforms {
+    /// Poses' units per unit of depth.
+    depth_unit: f64,
+    photos: Vec<Photo>,
+}
+
+/// A listed photo; paths as they are written.
+struct Photo {
+    file_path: String,
+    mask_path: Option<String>,
+    depth_file_path: Option<String>,
+    lens: Lens,
+    world_from_camera: Se3,
 }
 
 impl Transforms {
     /// `path` is named in errors.
-    pub fn parse(text: &str, path: &Path) -> Result<Self, SequenceError> {
+    fn parse(text: &str, path: &Path) -> Result<Self, SequenceError> {
         let content = |what: String| SequenceError::Content { path: path.into(), what };
         let file: TransformsFile = parse_json(text, path)?;
-        let lens = file.lens().map_err(content)?;
+        file.check_model().map_err(content)?;
         let opengl_from_camera = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI);
-        let pose = |(index, frame): (usize, ListedFrame)| {
-            let world_from_opengl = checks::rigid(frame.transform_matrix.as_flattened())
-                .map_err(|what| content(format!("frame {index}, {}: {what}", frame.file_path)))?;
-            Ok::<_, SequenceError>((frame.file_path, world_from_opengl * opengl_from_camera))
+        let photo = |(index, frame): (usize, ListedFrame)| {
+            let ListedFrame { file_path, mask_path, depth_file_path, transform_matrix, lens } = frame;
+            let world_from_opengl = checks::rigid(transform_matrix.as_flattened())
+                .map_err(|what| content(format!("frame {index}, {file_path}: {what}")))?;
+            let (world_from_camera, lens) = (world_from_opengl * opengl_from_camera, lens.or(&file.lens));
+            Ok::<_, SequenceError>(Photo { file_path, mask_path, depth_file_path, lens, world_from_camera })
         };
-        Ok(Self { lens, photos: file.frames.into_iter().enumerate().map(pose).collect::<Result<_, SequenceError>>()? })
+        let depth_unit = file.depth_unit_scale_factor.unwrap_or(DEPTH_UNIT);
+        let photos = file.frames.into_iter().enumerate().map(photo).collect::<Result<_, SequenceError>>()?;
+        Ok(Self { depth_unit, photos })
+    }
+
+    /// The camera of a photo of that size, if its lens does not say its own.
+    fn camera(&self, photo: &Photo, size: (u32, u32)) -> Result<Camera, String> {
+        photo.lens.camera(size, 1.0 / self.depth_unit)
     }
 }
 
-/// The photo that a path means.
-fn photo(folder: &Path, file_path: &str) -> Option<PathBuf> {
+/// The image that a path means.
+fn image_file(folder: &Path, file_path: &str) -> Option<PathBuf> {
     ENDINGS.iter().map(|ending| folder.join(format!("{file_path}{ending}"))).find(|path| path.is_file())
 }
 
@@ -98,78 +140,28 @@ struct TransformsFile {
     is_fisheye: bool,
     #[serde(flatten)]
     lens: Lens,
+    depth_unit_scale_factor: Option<f64>,
     frames: Vec<ListedFrame>,
 }
 
 #[derive(Deserialize)]
 struct ListedFrame {
     file_path: String,
+    mask_path: Option<String>,
+    depth_file_path: Option<String>,
     transform_matrix: [[f64; 4]; 4],
     #[serde(flatten)]
     lens: Lens,
 }
 
-/// Pixels, and radians across the whole image.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Deserialize)]
-#[serde(default)]
-pub(super) struct Lens {
-    camera_angle_x: Option<f64>,
-    camera_angle_y: Option<f64>,
-    fl_x: Option<f64>,
-    fl_y: Option<f64>,
-    cx: Option<f64>,
-    cy: Option<f64>,
-    w: Option<f64>,
-    h: Option<f64>,
-    k1: f64,
-    k2: f64,
-    k3: f64,
-    k4: f64,
-    p1: f64,
-    p2: f64,
-}
-
 impl TransformsFile {
-    /// The one lens of all frames.
-    fn lens(&self) -> Result<Lens, String> {
+    fn check_model(&self) -> Result<(), String> {
         let model = self.camera_model.as_deref().unwrap_or("OPENCV");
-        if self.is_fisheye || !["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"].contains(&model)
-        {
-            let fisheye = if self.is_fisheye { " fisheye" } else { "" };
-            return Err(format!("{model}{fisheye} cameras are not known here; undistort the photos first"));
+        if !self.is_fisheye && KNOWN_MODELS.contains(&model) {
+            return Ok(());
         }
-        let of_frame = |frame: &ListedFrame| if frame.lens.is_given() { frame.lens } else { self.lens };
-        let lens = self.frames.first().map_or(self.lens, of_frame);
-        match self.frames.iter().position(|frame| of_frame(frame) != lens) {
-            Some(other) => Err(format!("frame {other} has another camera than frame 0; a recording needs one")),
-            None => Ok(lens),
-        }
-    }
-}
-
-impl Lens {
-    fn is_given(&self) -> bool {
-        self.fl_x.is_some() || self.camera_angle_x.is_some()
-    }
-
-    /// The camera of photos of that size, if it does not say its own.
-    pub fn camera(&self, (width, height): (u32, u32)) -> Result<Camera, String> {
-        let (w, h) = (self.w.unwrap_or(f64::from(width)), self.h.unwrap_or(f64::from(height)));
-        let side = |pixels: f64| {
-            let whole = (pixels.fract() == 0.0 && pixels > 0.0).then_some(pixels as u64);
-            whole.and_then(checks::side).ok_or_else(|| format!("{pixels} pixels are no size of an image"))
-        };
-        let focal_of_angle = |angle_rad: f64, pixels: f64| pixels / 2.0 / (angle_rad / 2.0).tan();
-        let fx = self.fl_x.or_else(|| self.camera_angle_x.map(|angle_rad| focal_of_angle(angle_rad, w)));
-        let fx = fx.ok_or("there is neither fl_x nor camera_angle_x")?;
-        let fy = self.fl_y.or_else(|| self.camera_angle_y.map(|angle_rad| focal_of_angle(angle_rad, h))).unwrap_or(fx);
-        if self.k4 != 0.0 {
-            return Err("lenses with k4 are not known here; undistort the photos first".into());
-        }
-        let (cx, cy) = (self.cx.unwrap_or(w / 2.0) - 0.5, self.cy.unwrap_or(h / 2.0) - 0.5);
-        let pinhole = Pinhole { fx, fy, cx, cy, width: side(w)?, height: side(h)? };
-        let distortion = Distortion { k1: self.k1, k2: self.k2, p1: self.p1, p2: self.p2, k3: self.k3 };
-        checks::camera(Camera { pinhole, distortion, depth_units_per_metre: 1.0 })
+        let fisheye = if self.is_fisheye { " fisheye" } else { "" };
+        Err(format!("{model}{fisheye} cameras are not known here; undistort the photos first"))
     }
 }
 
@@ -178,6 +170,7 @@ mod tests {
     use nalgebra::Point3;
 
     use super::*;
+    use crate::geometry::{Distortion, Pinhole};
 
     const LENS: &str = r#""fl_x": 10.0, "fl_y": 11.0, "cx": 4.0, "cy": 3.0, "w": 8, "h": 6.0, "k1": 0.1, "p2": 0.02"#;
     /// Straight down from two metres up, with the image's top towards the world's y; then a step to the right.
@@ -217,6 +210,48 @@ mod tests {
         assert!((on_floor(1, 0.0, 0.0) - Point3::new(1.0, 0.0, 0.0)).norm() < 1e-12);
     }
 
+    /// The first frame has a mask and a depth image, in millimetres; the second has neither.
+    fn with_mask_and_depth() -> String {
+        FRAMES.replacen("\"sharpness\": 3", "\"mask_path\": \"masks/b.png\", \"depth_file_path\": \"depth/b.png\"", 1)
+    }
+
+    #[test]
+    fn masks_and_depth_are_read() {
+        let folder = recording(LENS, &with_mask_and_depth());
+        let image = |name: &str| folder.path().join(name);
+        ["masks", "depth"].iter().for_each(|name| std::fs::create_dir(image(name)).unwrap());
+        let open = || Sequence::open(folder.path(), None, None).map_err(|error| error.to_string());
+        assert!(open().unwrap_err().contains("frame 0, ./images/b.png: there is no masks/b.png"));
+        image::GrayImage::from_fn(8, 6, |x, _| image::Luma([u8::from(x > 0)])).save(image("masks/b.png")).unwrap();
+        assert!(open().unwrap_err().contains("frame 0, ./images/b.png: there is no depth/b.png"));
+        let depth = image::ImageBuffer::from_fn(8, 6, |x, y| image::Luma([(1000 * x + y) as u16]));
+        depth.save(image("depth/b.png")).unwrap();
+        let sequence = open().unwrap();
+        assert_eq!(sequence.sensor, Sensor::Rgbd);
+        let frames = sequence.load_all(&[0, 1]).into_iter().map(Result::unwrap).collect::<Vec<_>>();
+        assert_eq!(frames[0].depth.as_ref().unwrap().at(2, 3), Some(2.003));
+        assert_eq!([0, 1].map(|x| frames[0].mask.as_ref().unwrap().get_pixel(x, 0).0[0]), [0, 1]);
+        assert!(frames[1].depth.is_none() && frames[1].mask.is_none());
+        image::GrayImage::new(8, 7).save(image("masks/b.png")).unwrap();
+        let message = open().unwrap_err();
+        assert!(message.contains("masks/b.png is 8x7, but the camera is 8x6"), "{message}");
+    }
+
+    #[test]
+    fn the_file_may_say_the_unit_of_its_depth() {
+        let unit = |factor: &str| open(&format!("{LENS}, \"depth_unit_scale_factor\": {factor}"), FRAMES);
+        assert_eq!(unit("0.25").unwrap().camera.depth_units_per_metre, 4.0);
+        assert!(unit("0").unwrap_err().contains("depth units"));
+    }
+
+    #[test]
+    fn a_missing_photo_is_left_out_and_the_others_keep_their_times() {
+        let sequence = open(LENS, &FRAMES.replace("images/b", "images/d")).unwrap();
+        assert_eq!(sequence.entries.iter().map(|entry| entry.timestamp_s).collect::<Vec<_>>(), [1.0]);
+        let poses = sequence.groundtruth.unwrap().poses;
+        assert_eq!((poses.len(), poses[0].timestamp_s, poses[0].world_from_camera.translation.x), (1, 1.0, 1.0));
+    }
+
     #[test]
     fn an_angle_is_a_lens_and_frames_may_carry_it() {
         let pinhole = open(r#""camera_angle_x": 1.5707963267948966"#, FRAMES).unwrap().camera.pinhole;
@@ -224,7 +259,23 @@ mod tests {
         assert_eq!((pinhole.cx, pinhole.cy, pinhole.width, pinhole.height), (3.5, 2.5, 8, 6));
         let each = FRAMES.replace("\"file_path\"", &format!("{LENS}, \"file_path\""));
         assert_eq!(open("", &each).unwrap().camera.pinhole.fy, 11.0);
-        assert!(open("", &each.replacen("11.0", "12.0", 1)).unwrap_err().contains("frame 1 has another camera"));
+    }
+
+    /// What a frame leaves out is the file's, and sizes follow from the photos where nobody says them.
+    #[test]
+    fn each_frame_may_have_its_own_lens() {
+        let other = FRAMES.replacen("\"images/a\"", "\"images/a\", \"fl_x\": 20.0, \"k1\": 0.3", 1);
+        let sequence = open(LENS, &other).unwrap();
+        let [first, second] = [0, 1].map(|i| *sequence.camera_of(i));
+        assert!(!sequence.has_one_camera());
+        assert_eq!((first.pinhole.fx, first.pinhole.fy, first.distortion.k1), (10.0, 11.0, 0.1));
+        assert_eq!((second.pinhole.fx, second.pinhole.fy, second.pinhole.cx), (20.0, 20.0, 3.5));
+        assert_eq!(second.distortion, Distortion { k1: 0.3, p2: 0.02, ..Distortion::default() });
+        let folder = recording(r#""fl_x": 10.0"#, FRAMES);
+        image::RgbImage::new(4, 12).save(folder.path().join("images/a.jpg")).unwrap();
+        let sequence = Sequence::open(folder.path(), None, None).unwrap();
+        assert_eq!((sequence.camera_of(0).pinhole.cx, sequence.camera_of(1).pinhole.cx), (3.5, 1.5));
+        assert_eq!(sequence.load(1).unwrap().color.dimensions(), (4, 12));
     }
 
     #[test]
@@ -233,7 +284,8 @@ mod tests {
             let message = open(lens, frames).map(|_| ()).unwrap_err();
             assert!(message.contains("transforms.json") && message.contains(part), "{message}");
         };
-        refused(LENS, &FRAMES.replace("images/a", "images/c"), "frame 1, images/c: there is no such file");
+        let both_gone = FRAMES.replace("images/a", "images/c").replace("images/b", "images/d");
+        refused(LENS, &both_gone, "2 of 2 listed images are missing, among them ./images/d.png");
         refused(LENS, &FRAMES.replacen("[0,0,1,2]", "[0,0,3,2]", 1), "frame 0, ./images/b.png: the first three");
         refused(LENS, &FRAMES.replacen("[0,0,1,2]", "[0,0,1]", 1), "transforms.json:3: ");
         refused(LENS, "[]", "lists no frames");

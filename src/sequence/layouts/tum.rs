@@ -68,7 +68,7 @@ fn pair(colors: Vec<ListedImage>, depths: &[ListedImage]) -> Vec<FrameEntry> {
             timestamp_s: color.timestamp_s,
             depth: nearest(color.timestamp_s).map(|d| d.path.clone()),
             color: color.path,
-            right: None,
+            ..FrameEntry::default()
         })
         .collect()
 }

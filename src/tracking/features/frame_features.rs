@@ -118,6 +118,7 @@ impl FrontEnd {
         let features = keypoints
             .into_iter()
             .zip(depths)
+            .filter(|(k, _)| frame.keeps(&k.pixel))
             .map(|(k, depth)| Feature {
                 pixel: self.camera.undistort_pixel(&k.pixel),
                 octave: k.octave,

@@ -69,6 +69,39 @@ pub fn triangulate(a: &View<'_>, at_a: &Vector2<f64>, b: &View<'_>, at_b: &Vecto
     in_front.then_some(Triangulated { point, parallax_cosine: cosine })
 }
 
+/// Features of a view with a known pose, and which of them to match.
+#[derive(Clone, Debug)]
+pub struct Candidates<'a> {
+    pub features: &'a [Feature],
+    /// Indices of features.
+    pub wanted: Vec<usize>,
+    pub camera_from_world: &'a Se3,
+}
+
+impl<'a> Candidates<'a> {
+    /// The features of a keyframe that show no landmark yet.
+    fn free(keyframe: &'a Keyframe) -> Self {
+        let wanted = (0..keyframe.features.len()).filter(|feature| keyframe.landmarks[*feature].is_none()).collect();
+        Self { features: &keyframe.features.features, wanted, camera_from_world: &keyframe.camera_from_world }
+    }
+
+    fn view<'b>(&'b self, pinhole: &'b Pinhole) -> View<'b> {
+        View { camera_from_world: self.camera_from_world, pinhole }
+    }
+}
+
+/// Two features that show one point.
+#[derive(Clone, Copy, Debug)]
+pub struct MatchedPoint {
+    /// Feature of the first view.
+    pub mine: usize,
+    /// Feature of the second view.
+    pub theirs: usize,
+    pub point: Point3<f64>,
+    /// Cosine of the angle between the two lines of sight.
+    pub parallax_cosine: f64,
+}
+
 /// Makes landmarks of what `keyframe` and the keyframes that share most with it see, and no landmark shows yet. Returns how many.
 pub fn triangulate_with_neighbours(map: &mut Map, keyframe: usize, rig: &Rig) -> usize {
     let config = &rig.config;
@@ -80,8 +113,8 @@ pub fn triangulate_with_neighbours(map: &mut Map, keyframe: usize, rig: &Rig) ->
         if (this.centre() - other.centre()).norm() < MIN_BASELINE_SHARE * depth {
             continue;
         }
-        let pairs = match_along_lines(this, other, rig);
-        for (mine, theirs, point) in pairs {
+        for MatchedPoint { mine, theirs, point, .. } in match_along_lines(&Candidates::free(this), &Candidates::free(other), rig)
+        {
             let landmark = map.add_landmark(Observation { keyframe, feature: mine }, point, config);
             map.add_observation(landmark, Observation { keyframe: neighbour, feature: theirs });
             map.refresh_geometry(landmark, config);
@@ -91,47 +124,35 @@ pub fn triangulate_with_neighbours(map: &mut Map, keyframe: usize, rig: &Rig) ->
     made
 }
 
-/// Pairs of features without a landmark that show one point, and that point; each feature at most once.
-fn match_along_lines(this: &Keyframe, other: &Keyframe, rig: &Rig) -> Vec<(usize, usize, Point3<f64>)> {
+/// Pairs of the wanted features that show one point; each feature at most once.
+pub fn match_along_lines(this: &Candidates<'_>, other: &Candidates<'_>, rig: &Rig) -> Vec<MatchedPoint> {
     let Rig { pinhole, config } = rig;
-    let other_from_this = other.camera_from_world * this.camera_from_world.inverse();
-    let fundamental = fundamental(&other_from_this, pinhole);
-    let free = |k: &Keyframe| (0..k.features.len()).filter(|f| k.landmarks[*f].is_none()).collect::<Vec<usize>>();
-    let candidates = free(other);
-    let mut taken: Vec<Option<(u32, usize, Point3<f64>)>> = vec![None; other.features.len()];
-    let views = (
-        View { camera_from_world: &this.camera_from_world, pinhole },
-        View { camera_from_world: &other.camera_from_world, pinhole },
-    );
-    for mine in free(this) {
-        let feature = &this.features.features[mine];
+    let fundamental = fundamental(&(other.camera_from_world * this.camera_from_world.inverse()), pinhole);
+    let mut taken: Vec<Option<(u32, MatchedPoint)>> = vec![None; other.features.len()];
+    for &mine in &this.wanted {
+        let feature = &this.features[mine];
         let line = fundamental * feature.pixel.push(1.0);
-        let Some((theirs, distance)) = best_on_line(feature, &line, other, &candidates, config) else { continue };
-        let found = &other.features.features[theirs];
-        let Some(met) = triangulate(&views.0, &feature.pixel, &views.1, &found.pixel) else { continue };
+        let Some((theirs, distance)) = best_on_line(feature, &line, other, config) else { continue };
+        let found = &other.features[theirs];
+        let Some(met) = triangulate(&this.view(pinhole), &feature.pixel, &other.view(pinhole), &found.pixel) else { continue };
         let agrees = met.parallax_cosine < MAX_PARALLAX_COSINE && {
-            let mine = Observed { feature, keyframe: this };
-            agree(&met.point, &mine, &Observed { feature: found, keyframe: other }, rig)
+            let mine = Observed { feature, view: this.view(pinhole) };
+            agree(&met.point, &mine, &Observed { feature: found, view: other.view(pinhole) }, config)
         };
-        if agrees && taken[theirs].is_none_or(|(d, ..)| distance < d) {
-            taken[theirs] = Some((distance, mine, met.point));
+        if agrees && taken[theirs].is_none_or(|(d, _)| distance < d) {
+            let Triangulated { point, parallax_cosine } = met;
+            taken[theirs] = Some((distance, MatchedPoint { mine, theirs, point, parallax_cosine }));
         }
     }
-    taken.into_iter().enumerate().filter_map(|(theirs, found)| found.map(|(_, mine, point)| (mine, theirs, point))).collect()
+    taken.into_iter().flatten().map(|(_, matched)| matched).collect()
 }
 
 /// The feature of `other` near the line whose descriptor is clearly the most similar.
-fn best_on_line(
-    feature: &Feature,
-    line: &Vector3<f64>,
-    other: &Keyframe,
-    candidates: &[usize],
-    config: &TrackingConfig,
-) -> Option<(usize, u32)> {
+fn best_on_line(feature: &Feature, line: &Vector3<f64>, other: &Candidates<'_>, config: &TrackingConfig) -> Option<(usize, u32)> {
     let norm_squared = line.x * line.x + line.y * line.y;
     let (mut best, mut second) = (None::<(usize, u32)>, u32::MAX);
-    for &i in candidates {
-        let candidate = &other.features.features[i];
+    for &i in &other.wanted {
+        let candidate = &other.features[i];
         let off = line.x * candidate.pixel.x + line.y * candidate.pixel.y + line.z;
         let sigma = config.pixel_sigma * config.pyramid_scale.powi(candidate.octave.into());
         let near = off * off <= CHI2_LINE * sigma * sigma * norm_squared;
@@ -150,21 +171,20 @@ fn best_on_line(
     best.filter(|(_, distance)| *distance <= MAX_DISTANCE && *distance as f32 <= RATIO * second as f32)
 }
 
-/// A feature of a keyframe.
+/// A feature of a view.
 struct Observed<'a> {
     feature: &'a Feature,
-    keyframe: &'a Keyframe,
+    view: View<'a>,
 }
 
 /// Whether a point projects to both features, at distances that fit their sizes.
-fn agree(point: &Point3<f64>, a: &Observed<'_>, b: &Observed<'_>, rig: &Rig) -> bool {
-    let Rig { pinhole, config } = rig;
-    let projects = |Observed { feature, keyframe }: &Observed<'_>| {
-        let class = feature.measurement(config).classify(pinhole, &(keyframe.camera_from_world * point).coords);
+fn agree(point: &Point3<f64>, a: &Observed<'_>, b: &Observed<'_>, config: &TrackingConfig) -> bool {
+    let projects = |Observed { feature, view }: &Observed<'_>| {
+        let class = feature.measurement(config).classify(view.pinhole, &(view.camera_from_world * point).coords);
         class == InlierClass::Full || (class == InlierClass::PixelOnly && feature.depth_metres.is_none())
     };
-    let size = |Observed { feature, keyframe }: &Observed<'_>| {
-        (point - keyframe.centre()).norm() / config.pyramid_scale.powi(feature.octave.into())
+    let size = |Observed { feature, view }: &Observed<'_>| {
+        (point - view.centre()).norm() / config.pyramid_scale.powi(feature.octave.into())
     };
     let ratio = size(a) / size(b);
     projects(a) && projects(b) && ratio < SIZE_SLACK && ratio > 1.0 / SIZE_SLACK

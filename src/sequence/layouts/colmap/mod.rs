@@ -1,10 +1,10 @@
 //! Photos with a sparse model by COLMAP (Schönberger & Frahm, *Structure-from-Motion Revisited*, CVPR 2016).
 //!
 //! `images/` beside `sparse/0/` (or `sparse/`) with `cameras`, `images` and `points3D`, each `.bin` or `.txt`. The poses are known: they
-//! become the truth, and the points with their colours seed a map. Photos have no times: sorted by name, the n-th has the timestamp of
-//! n seconds. COLMAP's pixels count from the image's corner, ours from the first pixel's centre: principal points move by half a pixel.
+//! become the truth, and the points with their colours seed a map. Photos have no times: sorted by name, the n-th listed one has the
+//! timestamp of n seconds. Up to half of them may be missing. COLMAP's pixels count from the image's corner, ours from the first pixel's centre: principal points move by half a pixel.
 //!
-//! Left out: models of several cameras, and fisheye lenses; both are refused.
+//! Left out: fisheye lenses, which are refused.
 
 pub(super) mod binary;
 pub(super) mod text;
@@ -12,13 +12,14 @@ pub(super) mod text;
 #[cfg(test)]
 mod tests;
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
 use super::row::{LayoutRow, parse_text};
 use crate::geometry::{Camera, Distortion, Pinhole, Se3, StampedPose, Trajectory};
-use crate::sequence::{FrameEntry, Sensor, Sequence, SequenceError, checks, folder_name, read_text};
+use crate::sequence::{FrameEntry, Sensor, Sequence, SequenceError, checks, existing, folder_name, read_text};
 use binary::Records;
 
 /// COLMAP's camera models in the order of their numbers, with how many parameters each has.
@@ -83,32 +84,17 @@ fn open(folder: &Path) -> Result<Sequence, SequenceError> {
     let has_points = ["points3D.bin", "points3D.txt"].iter().any(|name| model.join(name).is_file());
     let points = if has_points { read(&model, "points3D", binary::points, text::points)?.0 } else { Vec::new() };
     images.sort_by(|a, b| a.name.cmp(&b.name));
-    let first = images.first().ok_or_else(|| SequenceError::Empty { path: images_path.clone() })?;
-    if let Some(other) = images.iter().find(|image| image.camera != first.camera) {
-        let (a, b) = (&first.name, &other.name);
-        let what = format!("{a} and {b} have different cameras; a recording needs one, as COLMAP makes with single_camera");
-        return Err(SequenceError::Content { path: images_path, what });
-    }
-    let camera = cameras
-        .iter()
-        .find(|camera| camera.id == first.camera)
-        .ok_or_else(|| format!("there is no camera {}, which the images have", first.camera))
-        .and_then(camera_of)
-        .map_err(|what| SequenceError::Content { path: cameras_path, what })?;
-    let entry = |(index, image): (usize, &KnownImage)| {
+    let cameras = cameras_of(&images, &cameras).map_err(|what| SequenceError::Content { path: cameras_path, what })?;
+    let found = images.into_iter().enumerate().map(|(index, image)| {
+        let timestamp_s = index as f64;
         let color = folder.join("images").join(&image.name);
-        if !color.is_file() {
-            let what = format!("there is no photo {}; check that the recording was copied whole", color.display());
-            return Err(SequenceError::Content { path: images_path.clone(), what });
-        }
-        Ok(FrameEntry { timestamp_s: index as f64, color, depth: None, right: None })
-    };
-    let entries = images.iter().enumerate().map(entry).collect::<Result<Vec<_>, _>>()?;
-    let stamped = |(index, image): (usize, &KnownImage)| StampedPose {
-        timestamp_s: index as f64,
-        world_from_camera: image.camera_from_world.inverse(),
-    };
-    let groundtruth = Trajectory { poses: images.iter().enumerate().map(stamped).collect() };
+        let entry = FrameEntry { timestamp_s, color, camera: Some(cameras[&image.camera]), ..FrameEntry::default() };
+        let pose = StampedPose { timestamp_s, world_from_camera: image.camera_from_world.inverse() };
+        if entry.color.is_file() { Ok((entry, pose)) } else { Err(image.name) }
+    });
+    let (entries, poses): (Vec<FrameEntry>, Vec<StampedPose>) = existing(&images_path, found.collect())?.into_iter().unzip();
+    let camera = entries.first().and_then(|entry| entry.camera).ok_or(SequenceError::Empty { path: images_path })?;
+    let groundtruth = Trajectory { poses };
     let sequence = Sequence {
         points,
         groundtruth: Some(groundtruth),
@@ -116,6 +102,16 @@ fn open(folder: &Path) -> Result<Sequence, SequenceError> {
     };
     sequence.check_first_size()?;
     Ok(sequence)
+}
+
+/// The cameras that the images have, by their numbers.
+fn cameras_of(images: &[KnownImage], cameras: &[ModelCamera]) -> Result<BTreeMap<u32, Camera>, String> {
+    let wanted: BTreeSet<u32> = images.iter().map(|image| image.camera).collect();
+    let found = wanted.into_iter().map(|number| {
+        let camera = cameras.iter().find(|camera| camera.id == number);
+        Ok((number, camera_of(camera.ok_or_else(|| format!("there is no camera {number}, which images have"))?)?))
+    });
+    found.collect()
 }
 
 /// Reads one part of the model from the form that it has; the binary one goes first, as COLMAP's tools do it.

@@ -84,6 +84,34 @@ fn both_forms_give_the_same_photos_poses_and_points() {
     }
 }
 
+/// Photos of two cameras and sizes; the one that is first in the selection is the sequence's.
+#[test]
+fn each_photo_has_its_own_camera() {
+    let folder = recording();
+    let model = |name: &str| folder.path().join("sparse/0").join(name);
+    std::fs::write(model("cameras.txt"), format!("{CAMERAS}9 PINHOLE 4 12 20 21 2 6\n")).unwrap();
+    std::fs::write(model("images.txt"), IMAGES.replace("7 b c", "9 b c")).unwrap();
+    image::RgbImage::new(4, 12).save(folder.path().join("images/b c.png")).unwrap();
+    let mut sequence = Sequence::open(folder.path(), None, None).unwrap();
+    assert!(!sequence.has_one_camera());
+    assert_eq!([0, 1].map(|i| sequence.camera_of(i).pinhole.fx), [10.0, 20.0]);
+    assert_eq!([0, 1].map(|i| sequence.load(i).unwrap().color.dimensions()), [(8, 6), (4, 12)]);
+    sequence.select(Some(1..2), 1).unwrap();
+    assert!(sequence.has_one_camera());
+    assert_eq!((sequence.camera.pinhole.fx, sequence.camera_of(0).pinhole.fx), (20.0, 20.0));
+}
+
+#[test]
+fn a_missing_photo_is_left_out_and_the_others_keep_their_times() {
+    let folder = recording();
+    std::fs::remove_file(folder.path().join("images/a.png")).unwrap();
+    let sequence = Sequence::open(folder.path(), None, None).unwrap();
+    let poses = sequence.groundtruth.unwrap().poses;
+    assert_eq!((sequence.entries.len(), sequence.entries[0].timestamp_s), (1, 1.0));
+    assert_eq!((poses.len(), poses[0].timestamp_s), (1, 1.0));
+    assert!((poses[0].world_from_camera * Point3::origin() - Point3::new(-2.0, -3.0, -1.0)).norm() < 1e-12);
+}
+
 #[test]
 fn lenses_are_read_or_refused_by_name() {
     let with = |line: &str| {
@@ -120,8 +148,9 @@ fn damaged_texts_are_refused_with_file_and_line() {
     };
     assert!(spoil("images.txt", IMAGES.replace("4 7 a", "x 7 a")).contains("images.txt:5: `x` is no pose"));
     assert!(spoil("images.txt", IMAGES.replace("1 0 0 0 0", "0 0 0 0 0")).contains("images.txt:5: a pose needs"));
-    assert!(spoil("images.txt", IMAGES.replace("7 a.png", "7 d.png")).contains("no photo"));
-    assert!(spoil("images.txt", IMAGES.replace("7 a.png", "8 a.png")).contains("different cameras"));
+    let both_gone = IMAGES.replace("7 a.png", "7 d.png").replace("b c.png", "b d.png");
+    assert!(spoil("images.txt", both_gone).contains("images.txt: 2 of 2 listed images are missing, among them b d.png"));
+    assert!(spoil("images.txt", IMAGES.replace("7 a.png", "8 a.png")).contains("cameras.txt: there is no camera 8"));
     assert!(spoil("images.txt", String::new()).contains("images.txt lists no frames"));
     assert!(spoil("points3D.txt", POINTS.replace("255", "256")).contains("points3D.txt:3: `256` is no colour"));
     assert!(spoil("points3D.txt", POINTS.replace("-2", "inf")).contains("points3D.txt:2: the position is not finite"));

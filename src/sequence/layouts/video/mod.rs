@@ -69,10 +69,10 @@ fn open(path: &Path, camera: Option<&str>) -> Result<Sequence, SequenceError> {
             let what = format!("was filmed as {width}x{height}, whichever way players turn it; calibrate the camera for that");
             return Err(SequenceError::Content { path: path.clone(), what });
         }
-        sequence.check_size(&path, (width, height))
+        crate::sequence::check_size(&camera, &path, (width, height))
     };
     let video = Video::scan(&path, is_cut, usual_fps, &check_size)?;
-    let entry = |&timestamp_s| FrameEntry { timestamp_s, color: path.clone(), depth: None, right: None };
+    let entry = |&timestamp_s| FrameEntry { timestamp_s, color: path.clone(), ..FrameEntry::default() };
     sequence.entries = video.times_s.iter().map(entry).collect();
     sequence.video = Some(Arc::new(video));
     Ok(sequence)

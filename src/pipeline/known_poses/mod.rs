@@ -1,0 +1,117 @@
+//! Replaces tracking where the recording provides poses.
+//!
+//! Photos become keyframes all, frames of a moving camera by the tracker's keyframe thresholds; held-out ones never.
+//! Frames without a pose count as lost. Where the recording has no depth, points begin the map: its own, or triangulated ones, which the
+//! plane sweep then uses as landmarks. The world's unit is that of the poses.
+
+mod scene;
+
+use std::time::Instant;
+
+pub(super) use scene::Scene;
+
+use super::progress::{TrackingProgress, guarded};
+use super::track_thread::{KeyframeSender, TrackSummary, TrackThread, right_image};
+use crate::geometry::{Se3, StampedPose};
+use crate::mapping::{DepthSource, Keyframe, MapperMessage};
+use crate::recording::Recording;
+use crate::run_folder::FrameRecord;
+use crate::sequence::{Frame, Rectifiers, Sensor};
+use crate::tracking::{KeyframePose, StageTimes};
+
+/// Neighbours that a keyframe names.
+const COVISIBLE: usize = 10;
+
+/// A keyframe so far.
+struct Known {
+    pose: KeyframePose,
+    /// Median distance of what it sees, in the world's unit.
+    distance: f64,
+}
+
+struct Follower<'a> {
+    recording: &'a Recording,
+    scene: &'a Scene<'a>,
+    rectifiers: Rectifiers,
+    keyframes: Vec<Known>,
+}
+
+impl Follower<'_> {
+    /// How far apart two views are: 1 where a keyframe is due, by distance or by angle.
+    fn apart(&self, a: &Known, world_from_camera: &Se3) -> f64 {
+        let a_from_camera = a.pose.world_from_camera.inverse() * world_from_camera;
+        let moved =
+            a_from_camera.translation.vector.norm() / (self.recording.config().tracking.keyframe_translation * a.distance);
+        moved.max(a_from_camera.rotation.angle() / self.recording.config().tracking.keyframe_rotation_rad)
+    }
+
+    fn is_due(&self, index: usize, world_from_camera: &Se3) -> bool {
+        let photos = self.recording.sequence().layout.is_photos();
+        let far = |last: &Known| self.apart(last, world_from_camera) >= 1.0;
+        !self.recording.config().replay.is_held_out(index) && (photos || self.keyframes.last().is_none_or(far))
+    }
+
+    /// The nearest keyframes, nearest first.
+    fn covisible(&self, world_from_camera: &Se3) -> Vec<usize> {
+        let mut nearest: Vec<(f64, usize)> =
+            self.keyframes.iter().map(|known| (self.apart(known, world_from_camera), known.pose.id)).collect();
+        nearest.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+        nearest.into_iter().take(COVISIBLE).map(|(_, id)| id).collect()
+    }
+
+    fn make_keyframe(&mut self, frame: &Frame, world_from_camera: Se3) -> Keyframe {
+        let sequence = self.recording.sequence();
+        let rectifier = self.rectifiers.of(sequence.camera_of(frame.index));
+        let mut image = rectifier.rectify(frame);
+        let (landmarks, mut depth_source) = (self.scene.landmarks(frame.index), DepthSource::Sensor);
+        if image.depth.is_none() && !landmarks.is_empty() {
+            image.depth = Some(rectifier.sparse_depth(&landmarks));
+            depth_source = DepthSource::Landmarks { right: right_image(&rectifier, sequence.sensor, frame) };
+        }
+        let (id, covisible) = (self.keyframes.len(), self.covisible(&world_from_camera));
+        let pose = KeyframePose { id, frame_index: frame.index, timestamp_s: frame.timestamp_s, world_from_camera };
+        let distance = image.median_depth_metres().unwrap_or_else(|| self.scene.distance());
+        self.keyframes.push(Known { pose, distance });
+        Keyframe { id, world_from_camera, image, depth_source, covisible }
+    }
+}
+
+/// Sends keyframes at their known poses until the frames end, or the mapper closes the channel.
+pub(super) fn follow(thread: &TrackThread<'_>, scene: &Scene<'_>) -> TrackSummary {
+    let TrackThread { recording, frames, mapper, progress } = *thread;
+    let (sequence, config) = (recording.sequence(), recording.config());
+    let mut summary = TrackSummary::default();
+    let mut sender = KeyframeSender::new(mapper, config.replay.real_time);
+    let mut follower = Follower { recording, scene, rectifiers: Rectifiers::new(config.map_scale), keyframes: Vec::new() };
+    if sequence.sensor != Sensor::Rgbd && mapper.send(MapperMessage::Points(scene.thinned_points())).is_err() {
+        return summary;
+    }
+    for frame in frames {
+        let started = Instant::now();
+        let known = recording.known_pose(frame.timestamp_s);
+        let mut keyframe = None;
+        if let Some(world_from_camera) = known {
+            summary.trajectory.push((frame.index, StampedPose { timestamp_s: frame.timestamp_s, world_from_camera }));
+            if follower.is_due(frame.index, &world_from_camera) {
+                keyframe = Some(guarded("tracking", || Ok(follower.make_keyframe(&frame, world_from_camera))));
+            }
+        }
+        let times = StageTimes { features_ms: started.elapsed().as_secs_f64() * 1e3, ..StageTimes::default() };
+        summary.frames.push(FrameRecord { frame: frame.index, lost: known.is_none(), times });
+        let (frames_done, keyframes) = (frame.index + 1, follower.keyframes.len());
+        progress.tracking.force_push(TrackingProgress { frames_done, keyframes, lost: known.is_none() });
+        let message = match keyframe.transpose() {
+            Ok(keyframe) => keyframe.map(|keyframe| MapperMessage::Keyframe(Box::new(keyframe))),
+            Err(error) => {
+                summary.error = Some(error);
+                break;
+            }
+        };
+        if !sender.retry() || !message.is_none_or(|message| sender.send(message)) {
+            break;
+        }
+    }
+    summary.deferred = sender.finish();
+    summary.keyframes = follower.keyframes.iter().map(|known| known.pose).collect();
+    summary
+}
