@@ -283,6 +283,32 @@ mod tests {
     }
 
     #[test]
+    fn ssim_is_the_mean_over_the_windows_of_valid_pixels() {
+        let (width, height) = (15, 14);
+        let mut rng = fastrand::Rng::with_seed(8);
+        let mut noise = || {
+            let pixels = (0..width * height).map(|_| [rng.f32(), rng.f32(), rng.f32()]).collect();
+            ImageF32::new(width, height, pixels).unwrap()
+        };
+        let (rendered, recorded) = (noise(), noise());
+        // One row and one pixel were not recorded.
+        let valid: Arc<[bool]> = (0..width * height).map(|i| i / width != 6 && i != 7 * width + 8).collect();
+        let [a, b] = [&rendered, &recorded].map(|image| image.clone().masked(Some(&valid)));
+        let window = |image: &ImageF32, x: usize, y: usize| {
+            let at = |i: usize| image.pixels[(y - RADIUS + i / WINDOW) * width + x - RADIUS + i % WINDOW];
+            ImageF32::new(WINDOW, WINDOW, (0..WINDOW * WINDOW).map(at).collect()).unwrap()
+        };
+        let centres = (RADIUS..height - RADIUS).flat_map(|y| (RADIUS..width - RADIUS).map(move |x| (x, y)));
+        let windows: Vec<f64> = centres
+            .filter(|&(x, y)| valid[y * width + x])
+            .map(|(x, y)| ssim(&window(&a, x, y), &window(&b, x, y)).unwrap())
+            .collect();
+        assert_eq!(windows.len(), 3 * 5 - 1);
+        let expected = windows.iter().sum::<f64>() / windows.len() as f64;
+        assert!((ssim(&rendered, &b).unwrap() - expected).abs() < 1e-12);
+    }
+
+    #[test]
     fn sizes_are_checked() {
         let error = psnr(&gray(4, 3, 0.0), &gray(3, 4, 0.0)).unwrap_err();
         assert_eq!(error, ImageError::Size { a: (4, 3), b: (3, 4) });

@@ -321,6 +321,13 @@ mod tests {
     }
 
     #[test]
+    fn the_usual_period_is_the_median() {
+        assert_eq!(median_period_s(&path([0.0, 0.125, 0.5, 1.0, 1.5])), 0.5);
+        assert_eq!(median_period_s(&path([0.0, 0.5, 0.625, 2.0])), 0.5);
+        assert_eq!(median_period_s(&path([1.0])), f64::INFINITY);
+    }
+
+    #[test]
     fn a_pose_of_the_truth_that_serves_twice_is_no_step() {
         let truth = path([0.0, 0.1, 0.2, 0.3]);
         let estimate = path([0.0, 0.1, 0.11, 0.2]);

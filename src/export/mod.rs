@@ -252,6 +252,13 @@ mod tests {
     }
 
     #[test]
+    fn formats_of_other_names_are_not_equal() {
+        static OTHER: FormatRow = FormatRow { name: "other", ..ply::FORMAT };
+        assert_ne!(MapFormat(&OTHER), MapFormat::default());
+        assert_eq!(MapFormat(&OTHER), MapFormat(&OTHER));
+    }
+
+    #[test]
     fn every_format_gives_back_what_it_took() {
         let folder = tempfile::tempdir().unwrap();
         for &format in MapFormat::all() {

@@ -129,6 +129,8 @@ fn headers_that_are_not_ours_say_what_is_wrong() {
     assert!(message("float nx", "float f_rest_0").contains("1 properties are called f_rest_*"));
     assert!(message("float nx", "float x").contains("there twice"));
     assert!(message("float nx", "list uchar int nx").contains("not understood"));
+    let early = message("element vertex 1\nproperty float x\n", "property float x\nelement vertex 1\n");
+    assert!(early.contains("map.ply:3: `property float x` is not understood"), "{early}");
     assert!(message("float nx", "half nx").contains("`half`"));
     assert!(message("element vertex 1", "element chunk 1\nelement vertex 1").contains("before the vertices"));
     assert!(message("format binary_little_endian 1.0\n", "").contains("says the format"));

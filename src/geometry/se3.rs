@@ -81,7 +81,7 @@ mod tests {
     #[test]
     fn no_angle_loses_precision() {
         let axis = Vector3::new(0.2, -0.7, 0.5).normalize();
-        for angle in (0..120).map(|k| 1e-12 * 10f64.powf(0.1 * f64::from(k))) {
+        for angle in (0..120).map(|k| 1e-12 * 10f64.powf(0.1 * f64::from(k))).chain([0.0]) {
             let theta = axis * angle;
             let tau = Vector6::new(7.0, -3.0, 9.0, theta.x, theta.y, theta.z);
             let error = (log(&exp(&tau)) - tau).norm();

@@ -182,11 +182,22 @@ mod tests {
     }
 
     #[test]
+    fn the_nearest_pose_is_found_and_of_two_the_earlier() {
+        let pose = |timestamp_s| StampedPose { timestamp_s, world_from_camera: Se3::identity() };
+        let trajectory = Trajectory { poses: [0.0, 1.0, 3.0].map(pose).to_vec() };
+        let found = [-1.0, -0.5, 0.0, 0.5, 0.75, 1.0, 2.0, 2.25, 3.0, 3.5, 4.0].map(|t| trajectory.nearest(t, 0.75));
+        assert_eq!(found, [None, Some(0), Some(0), Some(0), Some(1), Some(1), None, Some(2), Some(2), Some(2), None]);
+        assert_eq!(trajectory.nearest(2.0, 1.0), Some(1));
+        assert_eq!(Trajectory::default().nearest(0.0, 1.0), None);
+    }
+
+    #[test]
     fn errors_name_the_file_and_the_line() {
         let message = |text: &str| parse(text).unwrap_err().to_string();
         assert!(message("# head\n0 0 0 0 0 0 0 1\n1 0 0 NaN 0 0 0 1\n").starts_with("poses.txt:3: `NaN`"));
         assert!(message("0 0 0 0 0 0 1\n").starts_with("poses.txt:1: fewer"));
         assert!(message("0 0 0 0 0 0 0 0\n").contains("no length"));
+        assert!(message("0 0 0 0 0 9e-5 0 0\n").contains("no length") && parse("0 0 0 0 0 1e-4 0 0\n").is_ok());
         assert!(message("1 0 0 0 0 0 0 1\n0.5 0 0 0 0 0 0 1\n").contains("sort the file"));
     }
 }

@@ -274,6 +274,37 @@ mod tests {
     }
 
     #[test]
+    fn a_checkpoint_gives_back_the_configuration_of_its_run() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("checkpoint.bin");
+        let config = Config::default().with_settings(&["mapping.window.recent=9"]).unwrap();
+        let written = Checkpoint::write(&path, &Identity { config: config.to_toml(), ..identity() }, None).unwrap();
+        assert_eq!(std::fs::metadata(&path).unwrap().len(), written as u64);
+        let read = Checkpoint::read(&path).unwrap();
+        assert_eq!(read.config().unwrap(), config);
+        assert!(read.state.is_none());
+    }
+
+    #[test]
+    fn a_checkpoint_gives_back_the_records_of_its_run() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("checkpoint.bin");
+        let record = |id| KeyframeRecord {
+            report: KeyframeReport { id, inserted: 7, ..KeyframeReport::default() },
+            done_s: 2.5,
+            busy_s: 0.5,
+            waiting: 3,
+            host_bytes: Some(1 << 30),
+        };
+        let records = [record(4), record(6)];
+        let elapsed = Elapsed { wall_s: 40.0, resumed: 2 };
+        let state = RunState::new(MessageDigest::default(), MapperState::default(), &records, &[Vec::new()], elapsed);
+        Checkpoint::write(&path, &identity(), Some(&state)).unwrap();
+        let read = Checkpoint::read(&path).unwrap().state.unwrap();
+        assert_eq!((read.records(), read.feedback, read.elapsed), (records.to_vec(), vec![Vec::new()], elapsed));
+    }
+
+    #[test]
     fn damaged_files_are_refused_whatever_they_hold() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("checkpoint.bin");

@@ -143,7 +143,10 @@ fn interval(recording: &Recording) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::Config;
+    use crate::geometry::Se3;
     use crate::mapping::MapperState;
+    use crate::synthetic::{self, CameraConfig, SceneConfig};
 
     fn checkpointer(every: usize, resume_from: Option<RunState>) -> Checkpointer {
         Checkpointer::new(Path::new("out/checkpoint.bin"), Identity::default(), every, resume_from)
@@ -158,6 +161,43 @@ mod tests {
         assert_eq!([1, 2, 3, 7, 8, usize::MAX].map(due), [7, 3, 2, 1, 0, 0]);
         let mut third = checkpointer(3, None);
         assert_eq!([(); 6].map(|()| third.is_due()), [false, false, true, false, false, true]);
+    }
+
+    #[test]
+    fn checkpoints_come_as_often_as_the_configuration_says() {
+        let folder = tempfile::tempdir().unwrap();
+        let room = folder.path().join("room");
+        let camera = CameraConfig { width: 32, height: 24, fx: 26.0, fy: 26.0, cx: 15.5, cy: 11.5, ..CameraConfig::default() };
+        let scene = SceneConfig { frames: 2, camera, ..SceneConfig::default() };
+        synthetic::generate(&scene, &room, &|_, _| {}).unwrap();
+        let every = |checkpoint_every| {
+            let config = Config { checkpoint_every, ..Config::for_recording(&room) };
+            interval(&Recording::open(config).unwrap())
+        };
+        assert_eq!([every(Some(1)), every(Some(3)), every(None)], [1, 3, usize::MAX]);
+    }
+
+    #[test]
+    fn what_the_mapper_receives_is_in_the_digest() {
+        let message = MapperMessage::PoseUpdate(vec![(1, Se3::translation(0.5, 0.0, 0.0))]);
+        let (mut run, mut digest) = (checkpointer(1, None), MessageDigest::default());
+        run.received(&message);
+        digest.update(&message);
+        assert_eq!(run.digest(), digest);
+    }
+
+    #[test]
+    fn feedback_is_kept_keyframe_by_keyframe() {
+        let pair = RefinedPair {
+            keyframe: 2,
+            relative_to: 1,
+            keyframe_from_relative: Se3::identity(),
+            sigma_translation_metres: 0.01,
+            sigma_rotation_rad: 0.001,
+        };
+        let mut run = checkpointer(1, None);
+        [Vec::new(), vec![pair]].into_iter().for_each(|refined| run.sent_feedback(refined));
+        assert_eq!(run.feedback, [Vec::new(), vec![pair]]);
     }
 
     #[test]

@@ -72,6 +72,7 @@ fn means_leave_out_what_was_not_measured() {
     means.add(30.0, 0.7, None);
     let figures = means.figures().unwrap();
     assert_eq!((figures.count, figures.psnr_db, figures.depth_l1_m), (2, Some(25.0), Some(0.1)));
+    assert!((figures.ssim.unwrap() - 0.6).abs() < 1e-12, "{figures:?}");
     means.add(f64::INFINITY, 1.0, None);
     assert_eq!(means.figures().unwrap().psnr_db, None);
 }
