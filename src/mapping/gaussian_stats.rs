@@ -2,14 +2,13 @@
 //! go with it), its age, and what it was ever worth.
 
 use std::collections::BTreeMap;
-use std::ops::Range;
 
 use serde::{Deserialize, Serialize};
 
 use super::KeyframeId;
-use crate::geometry::Se3;
+use crate::geometry::{Se3, Sim3};
 use crate::optimise::GaussianScore;
-use crate::render::Plan;
+use crate::render::{Plan, RunMotion};
 
 /// A keyframe that has moved by less than both since its Gaussians did was only refined, and optimisation takes these along; a loop moves it
 /// further.
@@ -69,13 +68,13 @@ impl GaussianStats {
         &self.histories
     }
 
-    /// The runs of Gaussians whose keyframe is among `motions`, and each run's motion.
-    pub fn moved(&self, motions: &BTreeMap<KeyframeId, Se3>) -> Vec<(Range<usize>, Se3)> {
+    /// The runs of Gaussians whose keyframe is among `motions`, ascending.
+    pub fn moved(&self, motions: &BTreeMap<KeyframeId, Sim3>) -> Vec<RunMotion> {
         let mut runs = Vec::new();
         let mut first = 0;
         for run in self.histories.chunk_by(|a, b| a.anchor == b.anchor) {
-            if let Some(motion) = motions.get(&run[0].anchor) {
-                runs.push((first..first + run.len(), *motion));
+            if let Some(new_from_old) = motions.get(&run[0].anchor) {
+                runs.push(RunMotion { run: first..first + run.len(), new_from_old: *new_from_old });
             }
             first += run.len();
         }
@@ -103,9 +102,9 @@ mod tests {
         [(0, 4), (2, 3), (5, 2)].into_iter().for_each(|(keyframe, count)| stats.append(keyframe, count));
         let child = |parent| Child { parent, mean: Vec3::ZERO, raw_opacity: 0.0, log_scale: Vec3::ZERO };
         stats.apply(&Plan { keep: vec![0, 3, 4, 6, 8], children: [1, 5, 5].map(child).to_vec() });
-        let shift = Se3::translation(1.0, 0.0, 0.0);
-        let motions = BTreeMap::from([(2, shift), (5, shift), (7, shift)]);
-        assert_eq!(stats.moved(&motions), [(2..4, shift), (4..5, shift), (6..8, shift)]);
+        let new_from_old = Sim3::from(Se3::translation(1.0, 0.0, 0.0));
+        let motions = [2, 5, 7].map(|keyframe| (keyframe, new_from_old)).into();
+        assert_eq!(stats.moved(&motions), [2..4, 4..5, 6..8].map(|run| RunMotion { run, new_from_old }));
         assert!(stats.moved(&BTreeMap::new()).is_empty());
     }
 

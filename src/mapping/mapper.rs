@@ -156,12 +156,12 @@ impl Mapper {
         let updates: BTreeMap<KeyframeId, &Se3> = updates.iter().map(|(id, pose)| (*id, pose)).collect();
         for keyframe in &mut self.keyframes {
             if let Some(world_from_camera) = updates.get(&keyframe.id) {
-                motions.extend(keyframe.update_pose(world_from_camera).map(|motion| (keyframe.id, motion)));
+                motions.extend(keyframe.update_pose(world_from_camera).map(|motion| (keyframe.id, motion.into())));
             }
         }
         let moved = self.stats.moved(&motions);
         self.cloud.transform(&self.gpu, &moved)?;
-        Ok(moved.iter().map(|(run, _)| run.len()).sum())
+        Ok(moved.iter().map(|motion| motion.run.len()).sum())
     }
 
     /// Refined relative poses of the window, for the tracker; empty unless poses are refined.

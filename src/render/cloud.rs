@@ -1,15 +1,15 @@
 //! The map's Gaussians on the GPU: parameters, Adam's moments and averages of the parameters, in planes of vec4.
 
-use std::ops::Range;
+mod motion;
 
 use glam::{Quat, Vec3};
-use nalgebra::Point3;
 use serde::{Deserialize, Serialize};
+
+pub use motion::RunMotion;
 
 use super::layout::{BlendForm, GEOMETRY_PLANES, GatherSetup};
 use super::plan::{GaussianGeometry, Plan};
 use super::shaders;
-use crate::geometry::Se3;
 use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, plain, workgroups};
 use crate::splat::{GaussianCloud, ShDegree};
 
@@ -182,44 +182,6 @@ impl GpuCloud {
         }
         let most = gpu.max_storage_bytes() as usize / (self.planes() * 16);
         needed.next_power_of_two().min(limit).min(most).max(needed)
-    }
-
-    /// Moves runs of Gaussians rigidly (new_from_old, in the world) and forgets their moments, which belong to where they were. On the
-    /// host: this is rare. The harmonics above the constant stay as they are, for a closed loop turns little.
-    ///
-    /// # Errors
-    /// [`GpuError`] if a buffer does not fit or the device fails.
-    pub fn transform(&mut self, gpu: &Gpu, runs: &[(Range<usize>, Se3)]) -> Result<(), GpuError> {
-        if runs.is_empty() {
-            return Ok(());
-        }
-        for planes in [&self.parameters, &self.averages] {
-            let mut means: Vec<[f32; 4]> = planes.read(gpu, 0, self.count)?;
-            let mut rotations: Vec<[f32; 4]> = planes.read(gpu, 2 * self.capacity, self.count)?;
-            for (run, motion) in runs {
-                let [x, y, z, w] = motion.rotation.coords.map(|v| v as f32).into();
-                let turn = Quat::from_xyzw(x, y, z, w);
-                for (mean, rotation) in means[run.clone()].iter_mut().zip(&mut rotations[run.clone()]) {
-                    let p = motion * Point3::new(f64::from(mean[0]), f64::from(mean[1]), f64::from(mean[2]));
-                    *mean = [p.x as f32, p.y as f32, p.z as f32, mean[3]];
-                    let q = turn * Quat::from_xyzw(rotation[1], rotation[2], rotation[3], rotation[0]);
-                    *rotation = [q.w, q.x, q.y, q.z];
-                }
-            }
-            planes.write(gpu, 0, &means);
-            planes.write(gpu, 2 * self.capacity, &rotations);
-        }
-        let mut encoder = gpu.device.create_command_encoder(&Default::default());
-        for (run, _) in runs {
-            for plane in 0..self.planes() {
-                let (from, bytes) = ((plane * self.capacity + run.start) * 16, run.len() * 16);
-                for moments in [&self.moments_1, &self.moments_2] {
-                    encoder.clear_buffer(moments.raw(), from as u64, Some(bytes as u64));
-                }
-            }
-        }
-        gpu.queue.submit([encoder.finish()]);
-        Ok(())
     }
 
     /// The Gaussians at `chosen`, in this order, with room for `capacity`. Buffers are replaced one at a time: the old and the new ones never
