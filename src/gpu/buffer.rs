@@ -53,8 +53,7 @@ impl GpuBuffer {
         if size > limit {
             return Err(GpuError::TooLarge { label: label.into(), needed: size, limit });
         }
-        let raw =
-            gpu.device.create_buffer(&wgpu::BufferDescriptor { label: Some(label), size, usage, mapped_at_creation: false });
+        let raw = allocate(gpu, label, size, usage)?;
         gpu.memory.add(size);
         Ok(Self { raw, memory: gpu.memory.clone(), identity: Arc::default() })
     }
@@ -85,12 +84,7 @@ impl GpuBuffer {
         if bytes == 0 {
             return Ok(Vec::new());
         }
-        let staging = gpu.device.create_buffer(&wgpu::BufferDescriptor {
-            label: Some("readback"),
-            size: bytes,
-            usage: BufferUsages::MAP_READ | BufferUsages::COPY_DST,
-            mapped_at_creation: false,
-        });
+        let staging = allocate(gpu, "readback", bytes, BufferUsages::MAP_READ | BufferUsages::COPY_DST)?;
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
         encoder.copy_buffer_to_buffer(&self.raw, (first * element) as u64, &staging, 0, bytes);
         gpu.queue.submit([encoder.finish()]);
@@ -100,6 +94,28 @@ impl GpuBuffer {
         // The mapping has no alignment that a cast could rely on.
         Ok(view.chunks_exact(element).map(bytemuck::pod_read_unaligned).collect())
     }
+}
+
+impl Gpu {
+    /// Whether buffers of so many bytes in all can be had at present, found out by having them.
+    pub fn has_room(&self, bytes: u64) -> bool {
+        let largest = self.max_storage_bytes();
+        let sizes = (0..bytes.div_ceil(largest)).map(|i| largest.min(bytes - i * largest));
+        let pieces = sizes.map(|size| allocate(self, "trial", size.next_multiple_of(16), BufferUsages::STORAGE));
+        !self.memory.is_beyond(bytes) && pieces.collect::<Result<Vec<_>, _>>().is_ok()
+    }
+}
+
+/// A wgpu buffer. An adapter without the memory for it refuses at once, and goes on working.
+fn allocate(gpu: &Gpu, label: &str, size: u64, usage: BufferUsages) -> Result<wgpu::Buffer, GpuError> {
+    if gpu.memory.is_beyond(size) {
+        return Err(GpuError::OutOfMemory(label.into()));
+    }
+    let scope = gpu.device.push_error_scope(wgpu::ErrorFilter::OutOfMemory);
+    let descriptor = wgpu::BufferDescriptor { label: Some(label), size, usage, mapped_at_creation: false };
+    let raw = gpu.device.create_buffer(&descriptor);
+    let refused = pollster::block_on(scope.pop());
+    refused.map_or(Ok(raw), |error| Err(GpuError::OutOfMemory(format!("{label}: {error}"))))
 }
 
 impl Drop for GpuBuffer {

@@ -134,10 +134,18 @@ enum Failure {
 const MAX_WAIT: Duration = Duration::from_secs(600);
 
 /// Bytes in our buffers, now and at most.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(super) struct MemoryCount {
     now: AtomicU64,
     peak: AtomicU64,
+    /// The most that there may be.
+    limit: AtomicU64,
+}
+
+impl Default for MemoryCount {
+    fn default() -> Self {
+        Self { now: AtomicU64::new(0), peak: AtomicU64::new(0), limit: AtomicU64::new(u64::MAX) }
+    }
 }
 
 impl MemoryCount {
@@ -148,6 +156,11 @@ impl MemoryCount {
 
     pub(super) fn remove(&self, bytes: u64) {
         self.now.fetch_sub(bytes, Ordering::Relaxed);
+    }
+
+    /// Whether so many bytes more would exceed the limit.
+    pub(super) fn is_beyond(&self, bytes: u64) -> bool {
+        self.now.load(Ordering::Relaxed).saturating_add(bytes) > self.limit.load(Ordering::Relaxed)
     }
 }
 
@@ -309,6 +322,11 @@ impl Gpu {
             Err(error) => return Err(GpuError::Failed(error.to_string())),
         }
         self.check()
+    }
+
+    /// From now on buffers of more than `bytes` in all are refused as an adapter of so much memory would.
+    pub fn limit_memory(&self, bytes: u64) {
+        self.memory.limit.store(bytes, Ordering::Relaxed);
     }
 
     /// Bytes that our buffers hold now.

@@ -2,19 +2,20 @@
 //! go with it), its age, and what it was ever worth.
 
 use std::collections::BTreeMap;
-use std::ops::Range;
 
 use serde::{Deserialize, Serialize};
 
 use super::KeyframeId;
-use crate::geometry::Se3;
+use crate::geometry::{Se3, Sim3};
 use crate::optimise::GaussianScore;
-use crate::render::Plan;
+use crate::render::{Plan, RunMotion};
 
-/// A keyframe that has moved by less than both since its Gaussians did was only refined, and optimisation takes these along; a loop moves it
+/// A keyframe that has moved by less than each of these since its Gaussians did was only refined, and optimisation takes these along; a loop moves it
 /// further.
 const MIN_SHIFT_METRES: f64 = 0.01;
 const MIN_TURN_RAD: f64 = 0.5 * std::f64::consts::PI / 180.0;
+/// As far as [`MIN_SHIFT_METRES`] at the two metres of a room.
+const MIN_LOG_SCALE: f64 = 0.005;
 
 /// Statistics of one Gaussian.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -69,13 +70,13 @@ impl GaussianStats {
         &self.histories
     }
 
-    /// The runs of Gaussians whose keyframe is among `motions`, and each run's motion.
-    pub fn moved(&self, motions: &BTreeMap<KeyframeId, Se3>) -> Vec<(Range<usize>, Se3)> {
+    /// The runs of Gaussians whose keyframe is among `motions`, ascending.
+    pub fn moved(&self, motions: &BTreeMap<KeyframeId, Sim3>) -> Vec<RunMotion> {
         let mut runs = Vec::new();
         let mut first = 0;
         for run in self.histories.chunk_by(|a, b| a.anchor == b.anchor) {
-            if let Some(motion) = motions.get(&run[0].anchor) {
-                runs.push((first..first + run.len(), *motion));
+            if let Some(new_from_old) = motions.get(&run[0].anchor) {
+                runs.push(RunMotion { run: first..first + run.len(), new_from_old: *new_from_old });
             }
             first += run.len();
         }
@@ -83,11 +84,15 @@ impl GaussianStats {
     }
 }
 
-/// new_from_old, how a world moves that is held by a camera; `None` if that is no more than a refinement.
-pub(super) fn motion(old_world_from_camera: &Se3, new_world_from_camera: &Se3) -> Option<Se3> {
+/// new_from_old, how a world moves that is held by a camera, when distances from the camera grow by a factor; `None` if that is no more
+/// than a refinement.
+pub(super) fn motion(old_world_from_camera: &Se3, new_world_from_camera: &Se3, scale: f64) -> Option<Sim3> {
     let old_from_new = old_world_from_camera.inverse() * new_world_from_camera;
-    let far = old_from_new.translation.vector.norm() > MIN_SHIFT_METRES || old_from_new.rotation.angle() > MIN_TURN_RAD;
-    far.then(|| new_world_from_camera * old_world_from_camera.inverse())
+    let far = old_from_new.translation.vector.norm() > MIN_SHIFT_METRES
+        || old_from_new.rotation.angle() > MIN_TURN_RAD
+        || scale.ln().abs() > MIN_LOG_SCALE;
+    let world_from_old_camera = Sim3 { scale, ..Sim3::from(*new_world_from_camera) };
+    far.then(|| world_from_old_camera * Sim3::from(*old_world_from_camera).inverse())
 }
 
 #[cfg(test)]
@@ -103,9 +108,9 @@ mod tests {
         [(0, 4), (2, 3), (5, 2)].into_iter().for_each(|(keyframe, count)| stats.append(keyframe, count));
         let child = |parent| Child { parent, mean: Vec3::ZERO, raw_opacity: 0.0, log_scale: Vec3::ZERO };
         stats.apply(&Plan { keep: vec![0, 3, 4, 6, 8], children: [1, 5, 5].map(child).to_vec() });
-        let shift = Se3::translation(1.0, 0.0, 0.0);
-        let motions = BTreeMap::from([(2, shift), (5, shift), (7, shift)]);
-        assert_eq!(stats.moved(&motions), [(2..4, shift), (4..5, shift), (6..8, shift)]);
+        let new_from_old = Sim3::from(Se3::translation(1.0, 0.0, 0.0));
+        let motions = [2, 5, 7].map(|keyframe| (keyframe, new_from_old)).into();
+        assert_eq!(stats.moved(&motions), [2..4, 4..5, 6..8].map(|run| RunMotion { run, new_from_old }));
         assert!(stats.moved(&BTreeMap::new()).is_empty());
     }
 
@@ -114,10 +119,15 @@ mod tests {
         let old = Se3::new(Vector3::new(1.0, 2.0, 3.0), Vector3::new(0.1, -0.4, 0.2));
         let new = old * Se3::new(Vector3::new(0.05, 0.0, 0.0), Vector3::new(0.0, 0.03, 0.0));
         let p_in_camera = Point3::new(0.3, -0.2, 2.0);
-        let moved = motion(&old, &new).unwrap() * (old * p_in_camera);
-        assert!((moved - new * p_in_camera).norm() < 1e-12);
-        assert!(motion(&old, &(old * Se3::new(Vector3::new(0.0, 0.009, 0.0), Vector3::new(0.008, 0.0, 0.0)))).is_none());
-        assert!(motion(&old, &(old * Se3::new(Vector3::zeros(), Vector3::new(0.01, 0.0, 0.0)))).is_some());
+        for scale in [1.0, 0.8, 1.3] {
+            let moved = motion(&old, &new, scale).unwrap().act(&(old * p_in_camera));
+            assert!((moved - new * (p_in_camera * scale)).norm() < 1e-12);
+        }
+        assert!(motion(&old, &(old * Se3::new(Vector3::new(0.0, 0.009, 0.0), Vector3::new(0.008, 0.0, 0.0))), 1.0).is_none());
+        assert!(motion(&old, &(old * Se3::new(Vector3::zeros(), Vector3::new(0.01, 0.0, 0.0))), 1.0).is_some());
+        for scale in [0.99, 1.01] {
+            assert!(motion(&old, &old, scale).is_some() && motion(&old, &old, scale.powf(0.4)).is_none());
+        }
     }
 
     #[test]
@@ -136,8 +146,8 @@ mod tests {
 
     #[test]
     fn a_shift_counts_only_beyond_its_threshold() {
-        let shifted = |metres: f64| motion(&Se3::identity(), &Se3::translation(metres, 0.0, 0.0));
+        let shifted = |metres: f64| motion(&Se3::identity(), &Se3::translation(metres, 0.0, 0.0), 1.0);
         assert_eq!(shifted(MIN_SHIFT_METRES), None);
-        assert_eq!(shifted(2.0 * MIN_SHIFT_METRES), Some(Se3::translation(2.0 * MIN_SHIFT_METRES, 0.0, 0.0)));
+        assert_eq!(shifted(2.0 * MIN_SHIFT_METRES), Some(Se3::translation(2.0 * MIN_SHIFT_METRES, 0.0, 0.0).into()));
     }
 }

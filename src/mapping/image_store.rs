@@ -81,6 +81,22 @@ impl ImageStore {
             }
         }
     }
+
+    /// Replaces the depths of a stored image, metres.
+    ///
+    /// # Errors
+    /// If the temporary file cannot be written.
+    pub fn set_depth(&self, stored: &mut StoredImage, metres: &[f32]) -> io::Result<()> {
+        match stored {
+            StoredImage::InMemory(pixels) => pixels.depth_metres.copy_from_slice(metres),
+            StoredImage::InFile { at, pixels } => {
+                let mut file = self.file.as_ref().ok_or(io::ErrorKind::NotFound)?;
+                file.seek(SeekFrom::Start(*at + 4 * *pixels as u64))?;
+                file.write_all(bytemuck::cast_slice(metres))?;
+            }
+        }
+        Ok(())
+    }
 }
 
 #[cfg(test)]
@@ -92,10 +108,15 @@ mod tests {
         let image = |seed: u32| Pixels { color: (seed..seed + 6).collect(), depth_metres: vec![seed as f32 + 0.5; 6] };
         // Room for two of five, 48 bytes each.
         let mut store = ImageStore::new(100);
-        let stored: Vec<StoredImage> = (0..5).map(|seed| store.put(image(seed))).collect();
+        let mut stored: Vec<StoredImage> = (0..5).map(|seed| store.put(image(seed))).collect();
         assert_eq!(stored.iter().filter(|stored| matches!(stored, StoredImage::InMemory(_))).count(), 2);
         for k in [4, 0, 2, 3, 1, 2] {
             assert_eq!(*store.get(&stored[k]).unwrap(), image(k as u32));
+        }
+        [1, 3].into_iter().for_each(|k| store.set_depth(&mut stored[k], &[7.0; 6]).unwrap());
+        for k in 0..5 {
+            let depth_metres = if k == 1 || k == 3 { vec![7.0; 6] } else { image(k).depth_metres };
+            assert_eq!(*store.get(&stored[k as usize]).unwrap(), Pixels { depth_metres, ..image(k) });
         }
     }
 }

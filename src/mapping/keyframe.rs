@@ -1,20 +1,23 @@
 //! A keyframe as the mapper receives and keeps it.
 
+mod images;
+
 use std::borrow::Cow;
 
-use image::{GrayImage, Rgb, RgbImage};
+use image::GrayImage;
 use serde::{Deserialize, Serialize};
 
 use super::gaussian_stats;
-use super::image_store::{ImageStore, StoredImage};
+use super::image_store::ImageStore;
 use super::plane_sweep::{self, SourceView};
 use super::refine_poses::{PoseRefinement, RefinePosesConfig};
-use super::{KeyframeId, MappingError};
-use crate::geometry::{Pinhole, Se3};
+use super::{KeyframeId, MappingError, PoseUpdate};
+use crate::geometry::{Pinhole, Se3, Sim3};
 use crate::gpu::{Gpu, GpuError, plain};
-use crate::optimise::{Pixels, TargetImage, TrainingView};
+use crate::optimise::{Pixels, TrainingView};
 use crate::sequence::{DepthImage, RectifiedImage};
 use crate::splat::{Exposure, ViewCamera};
+use images::{Images, TileLosses, halved_pinhole};
 
 /// A keyframe from the tracker.
 #[derive(Clone, Debug)]
@@ -35,6 +38,14 @@ impl Keyframe {
     /// At the tracker's pose.
     pub fn camera(&self) -> ViewCamera {
         ViewCamera { pinhole: self.image.pinhole, camera_from_world: self.world_from_camera.inverse() }
+    }
+
+    /// Takes in a correction before the mapper has the keyframe. Depth of landmarks is scaled; measured depth stays.
+    pub fn update_pose(&mut self, update: &PoseUpdate) {
+        self.world_from_camera = update.world_from_camera;
+        if let (DepthSource::Landmarks { .. }, Some(depth)) = (&self.depth_source, &mut self.image.depth) {
+            depth.metres.iter_mut().for_each(|metres| *metres *= update.scale as f32);
+        }
     }
 }
 
@@ -71,6 +82,8 @@ pub(super) struct MappedKeyframe {
     pub tracked_from_world: Se3,
     /// camera_from_world at which its Gaussians were inserted, or to which they were last moved.
     anchored_from_world: Se3,
+    /// Factor by which lengths around it have grown since then.
+    scale_since_anchor: f64,
     pub refinement: PoseRefinement,
     /// Exposure of the recorded image against the map.
     pub exposure: Exposure,
@@ -84,16 +97,6 @@ pub(super) struct MappedKeyframe {
     pub loss: f32,
 }
 
-/// A keyframe's image, on the GPU or offloaded.
-#[derive(Debug)]
-struct Images {
-    whole: TargetImage,
-    /// Target at half the size, where coarse steps use it.
-    half: Option<TargetImage>,
-    /// Pixels of both once they are offloaded.
-    stored: Option<(StoredImage, Option<StoredImage>)>,
-}
-
 /// All of a keyframe but its image, which the recording has.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub(super) struct KeyframeState {
@@ -102,6 +105,7 @@ pub(super) struct KeyframeState {
     camera: ViewCamera,
     tracked_from_world: Se3,
     anchored_from_world: Se3,
+    scale_since_anchor: f64,
     refinement: PoseRefinement,
     exposure: Exposure,
     depth_metres: f64,
@@ -119,38 +123,6 @@ struct Swept {
     metres: Vec<f32>,
 }
 
-/// `[tiles]` of the image and of the one at half the size, empty where there is none.
-#[derive(Clone, Debug, Serialize, Deserialize)]
-struct TileLosses {
-    #[serde(with = "plain")]
-    whole: Vec<[f32; 4]>,
-    #[serde(with = "plain")]
-    half: Vec<[f32; 4]>,
-}
-
-impl Images {
-    /// Uploads an image; `with_half` also at half the size, if that is still an image worth comparing.
-    fn new(gpu: &Gpu, image: &RectifiedImage, with_half: bool) -> Result<Self, GpuError> {
-        let target = |image: &RectifiedImage| {
-            let depth = image.depth.as_ref().map(|d| d.metres.as_slice());
-            TargetImage::masked(gpu, &image.color, depth, image.valid.as_deref())
-        };
-        let worth = with_half && image.pinhole.width.min(image.pinhole.height) >= MIN_HALVED;
-        Ok(Self { whole: target(image)?, half: worth.then(|| target(&halved(image))).transpose()?, stored: None })
-    }
-
-    fn tile_losses(&self, gpu: &Gpu) -> Result<TileLosses, GpuError> {
-        let half = self.half.as_ref().map_or(Ok(Vec::new()), |half| half.tile_losses(gpu));
-        Ok(TileLosses { whole: self.whole.tile_losses(gpu)?, half: half? })
-    }
-
-    /// Says whether they are of images of these sizes.
-    fn set_tile_losses(&self, gpu: &Gpu, losses: &TileLosses) -> bool {
-        let half = self.half.as_ref().map_or(losses.half.is_empty(), |half| half.set_tile_losses(gpu, &losses.half));
-        self.whole.set_tile_losses(gpu, &losses.whole) && half
-    }
-}
-
 impl MappedKeyframe {
     /// Uploads the images, see [`Images::new`], as they were recorded.
     pub fn new(gpu: &Gpu, keyframe: &Keyframe, exposure: Exposure, with_half: bool) -> Result<Self, GpuError> {
@@ -160,6 +132,7 @@ impl MappedKeyframe {
             camera,
             tracked_from_world: camera.camera_from_world,
             anchored_from_world: camera.camera_from_world,
+            scale_since_anchor: 1.0,
             refinement: PoseRefinement::default(),
             exposure,
             depth_metres: image.median_depth_metres().unwrap_or(1.0),
@@ -171,15 +144,13 @@ impl MappedKeyframe {
     }
 
     pub fn state(&self, gpu: &Gpu, store: &ImageStore) -> Result<KeyframeState, MappingError> {
-        let swept = || match &self.image.stored {
-            Some((whole, _)) => Ok::<_, MappingError>(Swept { metres: store.get(whole)?.depth_metres.clone() }),
-            None => Ok(Swept { metres: self.image.whole.read_pixels(gpu)?.map_or(Vec::new(), |pixels| pixels.depth_metres) }),
-        };
+        let swept = || Ok::<_, MappingError>(Swept { metres: self.image.depth_metres(gpu, store)? });
         Ok(KeyframeState {
             id: self.id,
             camera: self.camera,
             tracked_from_world: self.tracked_from_world,
             anchored_from_world: self.anchored_from_world,
+            scale_since_anchor: self.scale_since_anchor,
             refinement: self.refinement,
             exposure: self.exposure,
             depth_metres: self.depth_metres,
@@ -217,6 +188,7 @@ impl MappedKeyframe {
             camera: state.camera,
             tracked_from_world: state.tracked_from_world,
             anchored_from_world: state.anchored_from_world,
+            scale_since_anchor: state.scale_since_anchor,
             refinement: state.refinement,
             exposure: state.exposure,
             depth_metres: state.depth_metres,
@@ -231,13 +203,23 @@ impl MappedKeyframe {
         Ok(Some(restored))
     }
 
-    /// The tracker moved it. Returns the motion of its Gaussians, new_from_old, once what has added up is more than a refinement.
-    pub fn update_pose(&mut self, world_from_camera: &Se3) -> Option<Se3> {
-        let camera_from_world = world_from_camera.inverse();
+    /// Takes in a correction of the tracker. Returns the motion of its Gaussians, new_from_old, once what has added up is more than a
+    /// refinement. Its estimated depth is scaled along; measured depth stays.
+    pub fn update_pose(&mut self, gpu: &Gpu, store: &mut ImageStore, update: &PoseUpdate) -> Result<Option<Sim3>, MappingError> {
+        let camera_from_world = update.world_from_camera.inverse();
+        self.refinement.refined_from_tracked.translation.vector *= update.scale;
         self.track(camera_from_world);
-        let motion = gaussian_stats::motion(&self.anchored_from_world.inverse(), world_from_camera)?;
-        self.anchored_from_world = camera_from_world;
-        Some(motion)
+        self.scale_since_anchor *= update.scale;
+        let scale = self.scale_since_anchor;
+        let motion = gaussian_stats::motion(&self.anchored_from_world.inverse(), &update.world_from_camera, scale);
+        if motion.is_some() {
+            (self.anchored_from_world, self.scale_since_anchor) = (camera_from_world, 1.0);
+            if scale != 1.0 && self.depth_is_estimated() {
+                self.image.scale_depth(gpu, store, scale)?;
+                self.depth_metres *= scale;
+            }
+        }
+        Ok(motion)
     }
 
     /// At the tracker's pose; its refinement goes along.
@@ -262,13 +244,7 @@ impl MappedKeyframe {
     /// # Errors
     /// If the device fails.
     pub fn offload(&mut self, gpu: &Gpu, store: &mut ImageStore) -> Result<(), GpuError> {
-        let Images { whole, half, stored } = &mut self.image;
-        let Some(pixels) = whole.read_pixels(gpu)? else { return Ok(()) };
-        let halved = half.as_ref().map_or(Ok(None), |half| half.read_pixels(gpu))?;
-        *stored = Some((store.put(pixels), halved.map(|pixels| store.put(pixels))));
-        whole.offload();
-        half.iter_mut().for_each(TargetImage::offload);
-        Ok(())
+        self.image.offload(gpu, store)
     }
 
     /// Pixels of the offloaded image, of the smaller one if `coarse` and there is one; `None` if they are on the GPU.
@@ -276,8 +252,7 @@ impl MappedKeyframe {
     /// # Errors
     /// If the store cannot be read.
     pub fn streamed<'a>(&'a self, coarse: bool, store: &ImageStore) -> std::io::Result<Option<Cow<'a, Pixels>>> {
-        let image = self.image.stored.as_ref().map(|(whole, half)| half.as_ref().filter(|_| coarse).unwrap_or(whole));
-        image.map(|image| store.get(image)).transpose()
+        self.image.streamed(coarse, store)
     }
 
     /// Pixels of the whole image as they were recorded.
@@ -322,45 +297,3 @@ impl MappedKeyframe {
         }
     }
 }
-
-/// Shorter sides below this many pixels are not halved.
-const MIN_HALVED: u32 = 64;
-
-/// Pinhole of the half-size image; an odd last row or column is left out.
-fn halved_pinhole(p: &Pinhole) -> Pinhole {
-    let half = |c: f64| (c + 0.5) * 0.5 - 0.5;
-    Pinhole { fx: 0.5 * p.fx, fy: 0.5 * p.fy, cx: half(p.cx), cy: half(p.cy), width: p.width / 2, height: p.height / 2 }
-}
-
-/// Means of 2×2 pixels; of the depths only those that are measured and on the nearest surface.
-fn halved(image: &RectifiedImage) -> RectifiedImage {
-    let pinhole = halved_pinhole(&image.pinhole);
-    let block = |x: u32, y: u32| [(0, 0), (1, 0), (0, 1), (1, 1)].map(|(dx, dy)| (2 * x + dx, 2 * y + dy));
-    let color = RgbImage::from_fn(pinhole.width, pinhole.height, |x, y| {
-        let sum = block(x, y)
-            .map(|(x, y)| image.color.get_pixel(x, y).0.map(u32::from))
-            .into_iter()
-            .fold([2; 3], |sum, c| [sum[0] + c[0], sum[1] + c[1], sum[2] + c[2]]);
-        Rgb(sum.map(|s| (s / 4) as u8))
-    });
-    let depth = image.depth.as_ref().map(|depth| {
-        let mean = |i: u32| {
-            let measured = block(i % pinhole.width, i / pinhole.width).map(|(x, y)| depth.at(x, y).unwrap_or(f32::INFINITY));
-            let nearest = measured.into_iter().fold(f32::INFINITY, f32::min);
-            let near = || measured.iter().filter(|m| m.is_finite() && **m < SAME_SURFACE * nearest);
-            let count = near().count();
-            if count > 0 { near().sum::<f32>() / count as f32 } else { 0.0 }
-        };
-        let metres = (0..pinhole.width * pinhole.height).map(mean).collect();
-        DepthImage { width: pinhole.width, height: pinhole.height, metres }
-    });
-    let valid = image.valid.as_ref().map(|valid| {
-        let width = image.pinhole.width;
-        let all = |i: u32| block(i % pinhole.width, i / pinhole.width).iter().all(|(x, y)| valid[(y * width + x) as usize]);
-        (0..pinhole.width * pinhole.height).map(all).collect()
-    });
-    RectifiedImage { pinhole, color, depth, valid }
-}
-
-/// Depths within this factor of each other are on one surface.
-const SAME_SURFACE: f32 = 1.1;

@@ -7,9 +7,9 @@ use super::gaussian_stats::GaussianHistory;
 use super::keyframe::MappedKeyframe;
 
 /// Bytes that the rasterizer's scratch and the scores take for each Gaussian.
-const SCRATCH_BYTES_EACH: u64 = 124;
+pub(super) const SCRATCH_BYTES_EACH: u64 = 124;
 /// Bytes for each in the list of those that stay, while the map changes.
-const LIST_BYTES_EACH: u64 = 4;
+pub(super) const LIST_BYTES_EACH: u64 = 4;
 /// Share of the memory that keyframes' images may take.
 const IMAGES_SHARE: f64 = 0.4;
 /// At least this many Gaussians are always allowed: less is no map.
@@ -85,10 +85,15 @@ pub(super) fn insertions_allowed(inserted: usize, most: usize) -> usize {
     inserted.min((INSERTED_SHARE * most as f64) as usize)
 }
 
-/// The Gaussians to keep so that at most `most` are left: the least useful go, the older first among equals. Ascending.
-pub(super) fn largest_contributions(histories: &[GaussianHistory], most: usize) -> Vec<u32> {
+/// The Gaussians to keep so that at most `most` are left: the least useful go, the older first among equals. Those that no view has scored
+/// yet, younger than `scored_age`, go last. Ascending.
+pub(super) fn largest_contributions(histories: &[GaussianHistory], most: usize, scored_age: u32) -> Vec<u32> {
+    let contribution = |i: &u32| {
+        let history = &histories[*i as usize];
+        if history.views == 0 && history.age < scored_age { f32::INFINITY } else { history.contribution }
+    };
     let mut ranked: Vec<u32> = (0..histories.len() as u32).collect();
-    ranked.sort_by(|a, b| histories[*b as usize].contribution.total_cmp(&histories[*a as usize].contribution).then(b.cmp(a)));
+    ranked.sort_by(|a, b| contribution(b).total_cmp(&contribution(a)).then(b.cmp(a)));
     ranked.truncate(most);
     ranked.sort_unstable();
     ranked
@@ -115,9 +120,12 @@ mod tests {
     fn the_least_useful_go_first() {
         let histories =
             [0.3, 0.0, 2.0, 0.0, 0.1].map(|contribution| GaussianHistory { contribution, ..GaussianHistory::default() });
-        assert_eq!(largest_contributions(&histories, 4), [0, 2, 3, 4]);
-        assert_eq!(largest_contributions(&histories, 2), [0, 2]);
-        assert_eq!(largest_contributions(&histories, 9), [0, 1, 2, 3, 4]);
+        assert_eq!(largest_contributions(&histories, 4, 0), [0, 2, 3, 4]);
+        assert_eq!(largest_contributions(&histories, 2, 0), [0, 2]);
+        assert_eq!(largest_contributions(&histories, 9, 0), [0, 1, 2, 3, 4]);
+        let mut some_scored = histories;
+        [0, 2, 4].into_iter().for_each(|i| some_scored[i].views = 1);
+        assert_eq!(largest_contributions(&some_scored, 3, 1), [1, 2, 3]);
     }
 
     #[test]

@@ -4,6 +4,7 @@ mod control;
 mod refine;
 mod relative_poses;
 mod state;
+mod within_limits;
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -22,14 +23,11 @@ use super::keyframe::{DepthSource, MappedKeyframe};
 use super::plane_sweep::{self, SourceView};
 use super::refine_poses::RefinedPair;
 use super::schedule::{self, Session, Step};
-use super::{
-    ExposureConfig, Keyframe, KeyframeId, LimitsConfig, MappingConfig, MappingError, exposure, initialise_from_points, insertion,
-    limits,
-};
+use super::{ExposureConfig, Keyframe, KeyframeId, MappingConfig, MappingError, PoseUpdate, exposure, initialise_from_points};
 use crate::geometry::Se3;
 use crate::gpu::Gpu;
 use crate::optimise::{AdamConfig, ErrorPixels, StepReport, TileSampling, Trainer, TrainingView};
-use crate::render::{GpuCloud, Plan, Rendered};
+use crate::render::{GpuCloud, Rendered};
 use crate::sequence::{KnownPoint, RectifiedImage};
 use crate::splat::{Exposure, GaussianCloud, ViewCamera};
 
@@ -78,6 +76,8 @@ pub struct Mapper {
     step_times: Vec<Duration>,
     /// Keyframes at the last online session of consolidation.
     consolidated: usize,
+    /// Whether the adapter has no room for more Gaussians, which is reported once.
+    is_full: bool,
 }
 
 impl Mapper {
@@ -96,6 +96,7 @@ impl Mapper {
             rng: Rng::with_seed(config.seed),
             step_times: Vec::new(),
             consolidated: 0,
+            is_full: false,
             gpu,
         })
     }
@@ -114,7 +115,7 @@ impl Mapper {
         let rendered = if is_compared && !self.cloud.is_empty() { Some(self.render(&keyframe.camera())?) } else { None };
         let exposure = self.exposure(&keyframe.image, rendered.as_ref());
         // Before its insertion: a bound on memory leaves to it what the image has left.
-        let mapped = MappedKeyframe::new(&self.gpu, &keyframe, exposure, self.config.learns_at_half_size())?;
+        let mapped = self.upload(&keyframe, exposure)?;
         self.keyframes.push(mapped);
         if exposure != Exposure::default() {
             keyframe.to_mut().image.color = exposure::corrected(&keyframe.image.color, &exposure);
@@ -142,28 +143,32 @@ impl Mapper {
     /// # Errors
     /// [`MappingError`] if a buffer does not fit or the device fails.
     pub fn add_points(&mut self, known: &[KnownPoint], anchor: KeyframeId) -> Result<(), MappingError> {
-        let new = initialise_from_points::gaussians(known, &self.config.points, self.config.sh_degree);
+        let mut new = initialise_from_points::gaussians(known, &self.config.points, self.config.sh_degree);
+        if self.probe(self.cloud.len() + new.len()) {
+            new = new.thinned(self.cloud.most(&self.gpu) - self.cloud.len());
+        }
         let left_out = self.cloud.append(&self.gpu, &new)?;
         self.stats.append(anchor, new.len() - left_out);
         Ok(())
     }
 
-    /// Moves earlier keyframes to better poses. The Gaussians inserted from a keyframe follow once its moves add up to more than a refinement;
-    /// returns how many did. Unknown ids are those that were never sent to the mapper.
+    /// Moves earlier keyframes to better poses, one update each. The Gaussians inserted from a keyframe follow by a similarity once its moves
+    /// add up to more than a refinement; returns how many did. Unknown ids are those that were never sent to the mapper.
     ///
     /// # Errors
     /// [`MappingError`] if a buffer does not fit or the device fails.
-    pub fn update_poses(&mut self, updates: &[(KeyframeId, Se3)]) -> Result<usize, MappingError> {
+    pub fn update_poses(&mut self, updates: &[PoseUpdate]) -> Result<usize, MappingError> {
         let mut motions = BTreeMap::new();
-        let updates: BTreeMap<KeyframeId, &Se3> = updates.iter().map(|(id, pose)| (*id, pose)).collect();
+        let updates: BTreeMap<KeyframeId, &PoseUpdate> = updates.iter().map(|update| (update.keyframe, update)).collect();
         for keyframe in &mut self.keyframes {
-            if let Some(world_from_camera) = updates.get(&keyframe.id) {
-                motions.extend(keyframe.update_pose(world_from_camera).map(|motion| (keyframe.id, motion)));
+            if let Some(update) = updates.get(&keyframe.id) {
+                let motion = keyframe.update_pose(&self.gpu, &mut self.images, update)?;
+                motions.extend(motion.map(|motion| (keyframe.id, motion)));
             }
         }
         let moved = self.stats.moved(&motions);
         self.cloud.transform(&self.gpu, &moved)?;
-        Ok(moved.iter().map(|(run, _)| run.len()).sum())
+        Ok(moved.iter().map(|motion| motion.run.len()).sum())
     }
 
     /// Refined relative poses of the window, for the tracker; empty unless poses are refined.
@@ -267,46 +272,6 @@ impl Mapper {
     /// Exposures of the keyframes against the map's, in the order of their arrival.
     pub fn exposures(&self) -> impl Iterator<Item = (KeyframeId, Exposure)> {
         self.keyframes.iter().map(|keyframe| (keyframe.id, keyframe.exposure))
-    }
-
-    fn insert_gaussians(&mut self, keyframe: &Keyframe, rendered: Option<&Rendered>) -> Result<usize, MappingError> {
-        if keyframe.image.depth.is_none() {
-            return Ok(0);
-        }
-        let mut new = insertion::gaussians(keyframe, rendered, &self.config.insertion, self.config.sh_degree);
-        if self.config.limits.limits_gaussians() {
-            let most = self.most_gaussians();
-            self.cloud.limit(most);
-            new = new.thinned(limits::insertions_allowed(new.len(), most));
-            let keep = limits::largest_contributions(self.stats.histories(), most - new.len());
-            let plan = Plan::keeping(keep);
-            self.cloud.apply(&self.gpu, &plan)?;
-            self.stats.apply(&plan);
-        }
-        let left_out = self.cloud.append(&self.gpu, &new)?;
-        self.stats.append(keyframe.id, new.len() - left_out);
-        Ok(new.len())
-    }
-
-    /// How many Gaussians there may be, at present, when there is to be room for one more keyframe's image.
-    fn most_gaussians(&self) -> usize {
-        let next_image = self.keyframes.iter().map(MappedKeyframe::image_bytes).max().unwrap_or(0);
-        let other = LimitsConfig::other_bytes(self.gpu.bytes() + next_image, self.cloud.bytes(), self.cloud.capacity());
-        self.config.limits.gaussians(self.cloud.bytes_each(), other)
-    }
-
-    /// Images beyond their number leave the GPU.
-    fn limit_gpu_images(&mut self) -> Result<(), MappingError> {
-        let largest = self.keyframes.iter().map(MappedKeyframe::image_bytes).max().unwrap_or(0);
-        let most = self.config.limits.gpu_images(largest);
-        let mut resident = self.keyframes.iter().filter(|k| k.is_resident()).count();
-        while resident > most
-            && let Some(k) = limits::least_needed_keyframe(&self.keyframes, self.config.window.recent)
-        {
-            self.keyframes[k].offload(&self.gpu, &mut self.images)?;
-            resident -= 1;
-        }
-        Ok(())
     }
 
     /// Steps over the window until all are taken or nothing more is gained; on the way some of them score the Gaussians, whose density is

@@ -1,5 +1,7 @@
 //! The tracker's messages to the mapper.
 
+use serde::{Deserialize, Serialize};
+
 use super::{Keyframe, KeyframeId};
 use crate::geometry::Se3;
 use crate::sequence::KnownPoint;
@@ -11,6 +13,24 @@ pub enum MapperMessage {
     Points(Vec<KnownPoint>),
     /// A new keyframe with its image.
     Keyframe(Box<Keyframe>),
-    /// New `world_from_camera` of earlier keyframes after bundle adjustment or a loop closure.
-    PoseUpdate(Vec<(KeyframeId, Se3)>),
+    /// New poses of earlier keyframes after bundle adjustment or a loop closure.
+    PoseUpdate(Vec<PoseUpdate>),
+}
+
+/// New pose of an earlier keyframe.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct PoseUpdate {
+    /// The keyframe.
+    pub keyframe: KeyframeId,
+    /// New pose, metres.
+    pub world_from_camera: Se3,
+    /// Factor by which lengths around the keyframe grow with this update; 1 for a rigid motion.
+    pub scale: f64,
+}
+
+impl PoseUpdate {
+    /// A rigid motion.
+    pub fn rigid(keyframe: KeyframeId, world_from_camera: Se3) -> Self {
+        Self { keyframe, world_from_camera, scale: 1.0 }
+    }
 }

@@ -184,6 +184,11 @@ impl TargetImage {
         self.pixels.as_ref().map(read).transpose()
     }
 
+    /// Replaces its depth, `[H * W]` metres, unless it is offloaded.
+    pub fn set_depth(&self, gpu: &Gpu, metres: &[f32]) {
+        self.pixels.iter().for_each(|pixels| pixels.depth.write(gpu, 0, metres));
+    }
+
     /// Frees its pixels on the GPU: from here on a [`TrainingView`](super::TrainingView) brings them along.
     pub fn offload(&mut self) {
         self.pixels = None;

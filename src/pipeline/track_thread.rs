@@ -7,12 +7,12 @@ use crossbeam::channel::{Receiver, Sender, TrySendError};
 use super::pose_feedback::PoseFeedbackReceiver;
 use super::progress::{TrackingProgress, guarded};
 use super::{PipelineError, Progress};
-use crate::geometry::{Se3, StampedPose, Trajectory};
-use crate::mapping::{DepthSource, Keyframe, KeyframeId, MapperMessage, RightImage};
+use crate::geometry::{StampedPose, Trajectory};
+use crate::mapping::{DepthSource, Keyframe, KeyframeId, MapperMessage, PoseUpdate, RightImage};
 use crate::recording::Recording;
 use crate::run_folder::FrameRecord;
 use crate::sequence::{Frame, Rectifier, Sensor};
-use crate::tracking::{KeyframePose, NewKeyframe, TrackedFrame, Tracker, TrackingState};
+use crate::tracking::{KeyframePose, KeyframeUpdate, NewKeyframe, TrackedFrame, Tracker, TrackingState};
 
 /// Result of the tracking thread, also when it ended early.
 #[derive(Debug, Default)]
@@ -32,8 +32,8 @@ pub(super) struct KeyframeSender<'a> {
     real_time: bool,
     /// Real time: the newest keyframe that found the channel full.
     waiting: Option<Box<Keyframe>>,
-    /// Real time: the newest poses that found the channel full.
-    waiting_poses: BTreeMap<KeyframeId, Se3>,
+    /// Real time: poses that found the channel full, what was sent of each keyframe in one update.
+    waiting_poses: BTreeMap<KeyframeId, PoseUpdate>,
     deferred: usize,
 }
 
@@ -49,22 +49,30 @@ impl<'a> KeyframeSender<'a> {
             return self.sender.send(message).is_ok();
         }
         match message {
-            MapperMessage::PoseUpdate(poses) => self.waiting_poses.extend(poses),
+            MapperMessage::PoseUpdate(updates) => self.add_poses(updates),
             MapperMessage::Keyframe(keyframe) => self.deferred += usize::from(self.waiting.replace(keyframe).is_some()),
             points @ MapperMessage::Points(_) => return self.sender.send(points).is_ok(),
         }
         self.retry()
     }
 
+    /// Of each keyframe the newest pose waits, and the product of the scales. A keyframe that waits itself takes its own.
+    fn add_poses(&mut self, updates: Vec<PoseUpdate>) {
+        for update in updates {
+            let scale = self.waiting_poses.get(&update.keyframe).map_or(1.0, |earlier| earlier.scale);
+            self.waiting_poses.insert(update.keyframe, PoseUpdate { scale: scale * update.scale, ..update });
+        }
+        if let Some(keyframe) = &mut self.waiting
+            && let Some(update) = self.waiting_poses.remove(&keyframe.id)
+        {
+            keyframe.update_pose(&update);
+        }
+    }
+
     /// Sends what waits, as far as there is room; `false` if the mapper has closed the channel.
     pub fn retry(&mut self) -> bool {
-        if let Some(keyframe) = &mut self.waiting
-            && let Some(pose) = self.waiting_poses.remove(&keyframe.id)
-        {
-            keyframe.world_from_camera = pose;
-        }
         if !self.waiting_poses.is_empty() {
-            let poses = self.waiting_poses.iter().map(|(id, pose)| (*id, *pose)).collect();
+            let poses = self.waiting_poses.values().copied().collect();
             match self.sender.try_send(MapperMessage::PoseUpdate(poses)) {
                 Ok(()) => self.waiting_poses.clear(),
                 Err(TrySendError::Full(_)) => return true,
@@ -80,9 +88,13 @@ impl<'a> KeyframeSender<'a> {
         true
     }
 
-    /// Sends the keyframe that waits, which no newer one replaces; returns the number of keyframes that the mapper never received. Poses that
-    /// wait are part of the final pose update.
-    pub fn finish(self) -> usize {
+    /// Sends all that waits and the final poses; returns the number of keyframes that the mapper never received. No newer keyframe replaces
+    /// the one that waits.
+    pub fn finish(mut self, last: Vec<PoseUpdate>) -> usize {
+        self.add_poses(last);
+        if !self.waiting_poses.is_empty() {
+            let _ = self.sender.send(MapperMessage::PoseUpdate(self.waiting_poses.into_values().collect()));
+        }
         if let Some(keyframe) = self.waiting {
             let _ = self.sender.send(MapperMessage::Keyframe(keyframe));
         }
@@ -132,21 +144,26 @@ impl TrackThread<'_> {
                 break;
             }
         }
-        // The adjustment in flight; its updates are part of the final pose update.
-        if let Err(error) = guarded("tracking", || Ok(tracker.finish()?)) {
+        // The adjustment in flight.
+        let adjusted = guarded("tracking", || Ok(tracker.finish()?)).unwrap_or_else(|error| {
             summary.error.get_or_insert(error);
-        }
-        summary.deferred = keyframes.finish();
+            Vec::new()
+        });
         summary.trajectory = tracker.trajectory();
         summary.keyframes = tracker.keyframes();
-        let final_poses = summary.keyframes.iter().map(|k| (k.id, k.world_from_camera)).collect();
-        let _ = self.mapper.send(MapperMessage::PoseUpdate(final_poses));
+        let scales: BTreeMap<KeyframeId, f64> = adjusted.iter().map(|update| (update.id, update.scale)).collect();
+        let last = |k: &KeyframePose| PoseUpdate {
+            scale: scales.get(&k.id).copied().unwrap_or(1.0),
+            ..PoseUpdate::rigid(k.id, k.world_from_camera)
+        };
+        summary.deferred = keyframes.finish(summary.keyframes.iter().map(last).collect());
         summary
     }
 
     /// Sends a frame's pose updates and keyframe; `false` if the mapper has closed the channel.
     fn send(&self, keyframes: &mut KeyframeSender<'_>, rectifier: &Rectifier, frame: &Frame, tracked: TrackedFrame) -> bool {
-        if !tracked.updates.is_empty() && !keyframes.send(MapperMessage::PoseUpdate(tracked.updates)) {
+        let updates: Vec<PoseUpdate> = tracked.updates.into_iter().map(pose_update).collect();
+        if !updates.is_empty() && !keyframes.send(MapperMessage::PoseUpdate(updates)) {
             return false;
         }
         let Some(NewKeyframe { id, world_from_camera, seen, covisible }) = tracked.keyframe else { return true };
@@ -160,6 +177,10 @@ impl TrackThread<'_> {
         let keyframe = Keyframe { id, world_from_camera, image, depth_source, covisible };
         keyframes.send(MapperMessage::Keyframe(Box::new(keyframe)))
     }
+}
+
+fn pose_update(KeyframeUpdate { id, world_from_camera, scale }: KeyframeUpdate) -> PoseUpdate {
+    PoseUpdate { keyframe: id, world_from_camera, scale }
 }
 
 /// The right image of a stereo frame, at the mapping resolution.
@@ -185,38 +206,55 @@ mod tests {
     use image::RgbImage;
 
     use super::*;
-    use crate::geometry::Pinhole;
-    use crate::sequence::RectifiedImage;
+    use crate::geometry::{Pinhole, Se3};
+    use crate::sequence::{DepthImage, RectifiedImage};
 
     fn keyframe(id: KeyframeId) -> MapperMessage {
         let pinhole = Pinhole { fx: 8.0, fy: 8.0, cx: 3.5, cy: 3.5, width: 8, height: 8 };
-        let image = RectifiedImage { pinhole, color: RgbImage::new(8, 8), depth: None, valid: None };
-        let world_from_camera = Se3::identity();
-        let keyframe = Keyframe { id, world_from_camera, image, depth_source: DepthSource::Sensor, covisible: Vec::new() };
+        let depth = DepthImage { width: 8, height: 8, metres: vec![2.0; 64] };
+        let image = RectifiedImage { pinhole, color: RgbImage::new(8, 8), depth: Some(depth), valid: None };
+        let depth_source = DepthSource::Landmarks { right: None };
+        let keyframe = Keyframe { id, world_from_camera: Se3::identity(), image, depth_source, covisible: Vec::new() };
         MapperMessage::Keyframe(Box::new(keyframe))
     }
 
-    fn moved(metres: f64) -> Se3 {
-        Se3::translation(metres, 0.0, 0.0)
+    fn moved(keyframe: KeyframeId, metres: f64, scale: f64) -> PoseUpdate {
+        PoseUpdate { keyframe, world_from_camera: Se3::translation(metres, 0.0, 0.0), scale }
     }
 
-    /// A loop moves each keyframe once: poses that find the channel full are sent later, the newest of each keyframe.
+    /// A loop moves each keyframe once: poses that find the channel full are sent later, the newest of each keyframe with all its scales.
     #[test]
     fn poses_that_find_the_channel_full_are_sent_later() {
         let (sender, messages) = bounded(1);
         let mut channel = KeyframeSender::new(&sender, true);
         assert!(channel.send(keyframe(0)));
-        assert!(channel.send(MapperMessage::PoseUpdate(vec![(0, moved(1.0)), (1, moved(2.0))])));
+        assert!(channel.send(MapperMessage::PoseUpdate(vec![moved(0, 1.0, 1.0), moved(1, 2.0, 1.5)])));
         assert!(channel.send(keyframe(2)) && channel.send(keyframe(3)));
-        assert!(channel.send(MapperMessage::PoseUpdate(vec![(1, moved(3.0)), (3, moved(4.0))])));
+        assert!(channel.send(MapperMessage::PoseUpdate(vec![moved(1, 3.0, 2.0), moved(3, 4.0, 1.25)])));
         assert!(matches!(messages.try_recv(), Ok(MapperMessage::Keyframe(k)) if k.id == 0));
         assert!(channel.retry());
         let Ok(MapperMessage::PoseUpdate(poses)) = messages.try_recv() else { panic!("poses come before the keyframe") };
-        assert_eq!(poses, [(0, moved(1.0)), (1, moved(3.0))]);
+        assert_eq!(poses, [moved(0, 1.0, 1.0), moved(1, 3.0, 3.0)]);
         assert!(channel.retry());
-        assert!(matches!(messages.try_recv(), Ok(MapperMessage::Keyframe(k)) if k.id == 3 && k.world_from_camera == moved(4.0)));
-        assert_eq!(channel.finish(), 1, "keyframe 2 was replaced");
+        let Ok(MapperMessage::Keyframe(sent)) = messages.try_recv() else { panic!("the keyframe that waited") };
+        assert_eq!((sent.id, sent.world_from_camera), (3, moved(3, 4.0, 1.0).world_from_camera));
+        assert!(sent.image.depth.unwrap().metres.iter().all(|metres| *metres == 2.5), "its depth is in the new scale");
+        assert_eq!(channel.finish(Vec::new()), 1, "keyframe 2 was replaced");
         drop(messages);
         assert!(!KeyframeSender::new(&sender, true).send(keyframe(4)));
+    }
+
+    #[test]
+    fn final_poses_carry_the_scales_that_wait() {
+        let (sender, messages) = bounded(2);
+        let mut channel = KeyframeSender::new(&sender, true);
+        [0, 1, 2].into_iter().for_each(|id| assert!(channel.send(keyframe(id))));
+        assert!(channel.send(MapperMessage::PoseUpdate(vec![moved(0, 1.0, 2.0), moved(2, 1.0, 2.0)])));
+        messages.iter().take(2).for_each(drop);
+        assert_eq!(channel.finish(vec![moved(0, 3.0, 1.5), moved(1, 2.0, 1.0), moved(2, 5.0, 1.5)]), 0);
+        let Ok(MapperMessage::PoseUpdate(poses)) = messages.try_recv() else { panic!("poses come before the keyframe") };
+        assert_eq!(poses, [moved(0, 3.0, 3.0), moved(1, 2.0, 1.0)]);
+        let Ok(MapperMessage::Keyframe(last)) = messages.try_recv() else { panic!("the keyframe that waited") };
+        assert_eq!(last.image.depth.unwrap().metres[0], 6.0);
     }
 }

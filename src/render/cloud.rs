@@ -1,20 +1,24 @@
 //! The map's Gaussians on the GPU: parameters, Adam's moments and averages of the parameters, in planes of vec4.
 
-use std::ops::Range;
+mod motion;
 
 use glam::{Quat, Vec3};
-use nalgebra::Point3;
 use serde::{Deserialize, Serialize};
+
+pub use motion::RunMotion;
 
 use super::layout::{BlendForm, GEOMETRY_PLANES, GatherSetup};
 use super::plan::{GaussianGeometry, Plan};
 use super::shaders;
-use crate::geometry::Se3;
 use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, plain, workgroups};
 use crate::splat::{GaussianCloud, ShDegree};
 
 /// Parameters, first and second moments, averages.
 const BUFFERS: usize = 4;
+/// Memory is full when less than this share of what growth needs would be left, for scratch that follows the views.
+const MARGIN: u64 = 4;
+/// The map does not grow by less than this share of itself.
+const LEAST_GROWTH: usize = 8;
 
 /// Gaussians on the GPU, `[planes, capacity]` vec4 in each buffer. Plane 0 holds position and raw opacity, 1 the log scale,
 /// 2 the rotation (w, x, y, z), 3 the constant colour, 4… the other harmonics, RGB each.
@@ -25,6 +29,8 @@ pub struct GpuCloud {
     capacity: usize,
     /// The most that there may be, if that is limited.
     limit: Option<usize>,
+    /// The most that the adapter has memory for, once that has been reached.
+    room: Option<usize>,
     parameters: GpuBuffer,
     moments_1: GpuBuffer,
     moments_2: GpuBuffer,
@@ -40,6 +46,7 @@ pub struct GpuCloud {
 pub struct CloudState {
     capacity: usize,
     limit: Option<usize>,
+    room: Option<usize>,
     /// `[BUFFERS, planes, N]`: parameters, first and second moments, averages.
     #[serde(with = "plain")]
     values: Vec<[f32; 4]>,
@@ -58,6 +65,7 @@ impl GpuCloud {
             count: 0,
             capacity,
             limit: None,
+            room: None,
             parameters: planes()?,
             moments_1: planes()?,
             moments_2: planes()?,
@@ -100,6 +108,28 @@ impl GpuCloud {
     /// Buffers are made for at most `limit` Gaussians from now on; whoever appends must keep to it.
     pub fn limit(&mut self, limit: usize) {
         self.limit = Some(limit);
+    }
+
+    /// The most Gaussians that the adapter has room for, as far as that is known: its largest binding, and its memory once reached.
+    pub fn most(&self, gpu: &Gpu) -> usize {
+        let bound = gpu.max_storage_bytes() as usize / (self.planes() * 16);
+        self.room.map_or(bound, |room| room.min(bound))
+    }
+
+    /// Before the map grows to `needed` Gaussians: reduces [`Self::most`] to what there is memory for, with `scratch_bytes` beside each and
+    /// a margin. Nothing is changed or lost by it.
+    pub fn probe(&mut self, gpu: &Gpu, needed: usize, scratch_bytes: u64) {
+        let mut capacity = self.capacity_for(gpu, needed.min(self.most(gpu)));
+        let (own, each, bytes) = (self.capacity, self.bytes_each(), self.bytes());
+        let has_room = |capacity: usize| {
+            let missing = (capacity as u64 * each + (capacity - own) as u64 * scratch_bytes).saturating_sub(bytes);
+            gpu.has_room(missing + missing / MARGIN)
+        };
+        while capacity > self.capacity && !has_room(capacity) {
+            let less = (capacity - self.capacity) / 2;
+            capacity = self.capacity + if less > self.capacity / LEAST_GROWTH { less } else { 0 };
+            self.room = Some(capacity);
+        }
     }
 
     /// Number of vec4 planes in each buffer.
@@ -180,46 +210,7 @@ impl GpuCloud {
         if needed <= self.capacity {
             return self.capacity.min(limit).max(needed);
         }
-        let most = gpu.max_storage_bytes() as usize / (self.planes() * 16);
-        needed.next_power_of_two().min(limit).min(most).max(needed)
-    }
-
-    /// Moves runs of Gaussians rigidly (new_from_old, in the world) and forgets their moments, which belong to where they were. On the
-    /// host: this is rare. The harmonics above the constant stay as they are, for a closed loop turns little.
-    ///
-    /// # Errors
-    /// [`GpuError`] if a buffer does not fit or the device fails.
-    pub fn transform(&mut self, gpu: &Gpu, runs: &[(Range<usize>, Se3)]) -> Result<(), GpuError> {
-        if runs.is_empty() {
-            return Ok(());
-        }
-        for planes in [&self.parameters, &self.averages] {
-            let mut means: Vec<[f32; 4]> = planes.read(gpu, 0, self.count)?;
-            let mut rotations: Vec<[f32; 4]> = planes.read(gpu, 2 * self.capacity, self.count)?;
-            for (run, motion) in runs {
-                let [x, y, z, w] = motion.rotation.coords.map(|v| v as f32).into();
-                let turn = Quat::from_xyzw(x, y, z, w);
-                for (mean, rotation) in means[run.clone()].iter_mut().zip(&mut rotations[run.clone()]) {
-                    let p = motion * Point3::new(f64::from(mean[0]), f64::from(mean[1]), f64::from(mean[2]));
-                    *mean = [p.x as f32, p.y as f32, p.z as f32, mean[3]];
-                    let q = turn * Quat::from_xyzw(rotation[1], rotation[2], rotation[3], rotation[0]);
-                    *rotation = [q.w, q.x, q.y, q.z];
-                }
-            }
-            planes.write(gpu, 0, &means);
-            planes.write(gpu, 2 * self.capacity, &rotations);
-        }
-        let mut encoder = gpu.device.create_command_encoder(&Default::default());
-        for (run, _) in runs {
-            for plane in 0..self.planes() {
-                let (from, bytes) = ((plane * self.capacity + run.start) * 16, run.len() * 16);
-                for moments in [&self.moments_1, &self.moments_2] {
-                    encoder.clear_buffer(moments.raw(), from as u64, Some(bytes as u64));
-                }
-            }
-        }
-        gpu.queue.submit([encoder.finish()]);
-        Ok(())
+        needed.next_power_of_two().min(limit).min(self.most(gpu)).max(needed)
     }
 
     /// The Gaussians at `chosen`, in this order, with room for `capacity`. Buffers are replaced one at a time: the old and the new ones never
@@ -302,7 +293,7 @@ impl GpuCloud {
                 values.extend(buffer.read::<[f32; 4]>(gpu, plane * self.capacity, self.count)?);
             }
         }
-        Ok(CloudState { capacity: self.capacity, limit: self.limit, values })
+        Ok(CloudState { capacity: self.capacity, limit: self.limit, room: self.room, values })
     }
 
     /// The map of a state, to the bit; `None` if that is no map of this degree.
@@ -316,7 +307,7 @@ impl GpuCloud {
             return Ok(None);
         }
         let mut cloud = Self::new(gpu, sh_degree, state.capacity)?;
-        (cloud.count, cloud.limit) = (count, state.limit);
+        (cloud.count, cloud.limit, cloud.room) = (count, state.limit, state.room);
         let buffers = cloud.buffers();
         for (i, plane) in state.values.chunks_exact(count.max(1)).enumerate() {
             buffers[i / planes].write(gpu, (i % planes) * cloud.capacity, plane);

@@ -9,7 +9,7 @@ mod sort;
 mod workspace;
 
 pub(crate) use cloud::cloud_from_planes;
-pub use cloud::{CloudState, GpuCloud};
+pub use cloud::{CloudState, GpuCloud, RunMotion};
 pub use layout::BlendForm;
 pub use plan::{Child, GaussianGeometry, Plan};
 pub use rasterizer::{PreparedView, Rasterizer, Rendered, ViewCounts};

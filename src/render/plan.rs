@@ -43,6 +43,16 @@ impl Plan {
         Self { keep, children: Vec::new() }
     }
 
+    /// Gaussians after the change.
+    pub fn len(&self) -> usize {
+        self.keep.len() + self.children.len()
+    }
+
+    /// Whether no Gaussian is left.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
     /// The parent of each child.
     pub fn parents(&self) -> impl Iterator<Item = u32> + '_ {
         self.children.iter().map(|child| child.parent)

@@ -44,10 +44,14 @@ fn plain(value: &impl Serialize) -> Vec<u8> {
 mod tests {
     use super::*;
     use crate::geometry::Se3;
+    use crate::mapping::PoseUpdate;
 
     #[test]
     fn order_and_every_bit_count() {
-        let pose_update = |id, x| MapperMessage::PoseUpdate(vec![(id, Se3::translation(x, 0.0, 0.0))]);
+        let scaled_update = |keyframe, x, scale| {
+            MapperMessage::PoseUpdate(vec![PoseUpdate { keyframe, world_from_camera: Se3::translation(x, 0.0, 0.0), scale }])
+        };
+        let pose_update = |keyframe, x| scaled_update(keyframe, x, 1.0);
         let digest_of = |messages: &[MapperMessage]| {
             let mut digest = MessageDigest::default();
             messages.iter().for_each(|message| digest.update(message));
@@ -56,7 +60,11 @@ mod tests {
         let one = digest_of(&[pose_update(1, 0.5), pose_update(2, 0.5)]);
         assert_eq!(one, digest_of(&[pose_update(1, 0.5), pose_update(2, 0.5)]));
         assert_eq!(one.messages, 2);
-        for other in [[pose_update(2, 0.5), pose_update(1, 0.5)], [pose_update(1, 0.5), pose_update(2, 0.5f64.next_up())]] {
+        for other in [
+            [pose_update(2, 0.5), pose_update(1, 0.5)],
+            [pose_update(1, 0.5), pose_update(2, 0.5f64.next_up())],
+            [pose_update(1, 0.5), scaled_update(2, 0.5, 1.0f64.next_up())],
+        ] {
             assert_ne!(one.digest, digest_of(&other).digest);
         }
     }

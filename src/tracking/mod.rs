@@ -50,8 +50,8 @@ pub struct TrackedFrame {
     pub inliers: usize,
     /// Set if this frame became a keyframe.
     pub keyframe: Option<NewKeyframe>,
-    /// Earlier keyframes that bundle adjustment or a closed loop moved, as they were taken in with this frame: id, new world_from_camera.
-    pub updates: Vec<(usize, Se3)>,
+    /// Earlier keyframes that bundle adjustment or a closed loop moved, as they were taken in with this frame.
+    pub updates: Vec<KeyframeUpdate>,
     /// Time of each stage; the only field that differs between identical runs.
     pub times: StageTimes,
 }
@@ -68,6 +68,17 @@ pub struct NewKeyframe {
     pub seen: Vec<(Vector2<f64>, f64)>,
     /// Other keyframes (id) and how many landmarks they share with this one, strongest first.
     pub covisible: Vec<(usize, usize)>,
+}
+
+/// Correction of an earlier keyframe.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct KeyframeUpdate {
+    /// Its id.
+    pub id: usize,
+    /// New pose, metres.
+    pub world_from_camera: Se3,
+    /// Factor by which closed loops have scaled the lengths around it since its last update; 1 with measured depth.
+    pub scale: f64,
 }
 
 /// A keyframe as currently estimated.

@@ -9,6 +9,7 @@ mod failures;
 mod long_optimisation;
 mod loop_moves_map;
 mod mapper;
+mod motion;
 mod properties;
 mod reference_gradients;
 mod refined_poses;

@@ -6,9 +6,9 @@ use std::sync::Arc;
 use image::{Rgb, RgbImage};
 use keysplat::geometry::{Pinhole, Se3};
 use keysplat::gpu::Gpu;
-use keysplat::mapping::{DepthSource, Keyframe, KeyframeReport, Mapper, MapperState, MappingConfig};
+use keysplat::mapping::{DepthSource, Keyframe, KeyframeReport, Mapper, MapperState, MappingConfig, PoseUpdate};
 use keysplat::sequence::{DepthImage, RectifiedImage};
-use keysplat::splat::Exposure;
+use keysplat::splat::{Exposure, ShDegree};
 
 const PINHOLE: Pinhole = Pinhole { fx: 60.0, fy: 60.0, cx: 31.5, cy: 23.5, width: 64, height: 48 };
 
@@ -59,6 +59,54 @@ fn memory_is_held_however_much_there_is_to_map() {
     assert!(held[39] > 1000 && held[39] < unbounded[39], "{held:?}, {unbounded:?}");
 }
 
+/// Bindings are the limit of one adapter, memory that of the other. Neither ends the run, and all views stay in the map.
+#[test]
+fn a_map_that_fills_the_adapter_goes_on_within_it() {
+    const LARGEST: u64 = 8 << 20;
+    const KEYFRAMES: usize = 20;
+    let Some(free) = adapter() else { return };
+    let mut config = MappingConfig { first_iterations: 10, iterations_per_keyframe: 10, ..Default::default() };
+    config.sh_degree = ShDegree::new(3).unwrap();
+    (config.insertion.stride, config.insertion.flat_stride) = (1, 1);
+    let elsewhere = |id| Keyframe { world_from_camera: Se3::translation(5.0 * id as f64, 0.0, 0.0), ..keyframe(id, true) };
+    let walk = |gpu: &Arc<Gpu>| {
+        let mut mapper = Mapper::new(gpu.clone(), &config).unwrap();
+        let gaussians: Vec<usize> =
+            (0..KEYFRAMES).map(|id| mapper.insert(&elsewhere(id), &|| false).unwrap().gaussians).collect();
+        (mapper, gaussians)
+    };
+    let unbounded = walk(&free).1;
+    let small = Gpu::open_small(None, LARGEST).unwrap();
+    let poor = Gpu::open(None).unwrap();
+    poor.limit_memory(free.peak_bytes() * 7 / 10);
+    for gpu in [small, poor] {
+        let (mut mapper, held) = walk(&gpu);
+        assert_eq!(held[..4], unbounded[..4], "as long as there is room, nothing changes");
+        let most = held.iter().max().unwrap();
+        assert!(held[KEYFRAMES - 1] < unbounded[KEYFRAMES - 1] * 4 / 5, "{held:?}, {unbounded:?}");
+        assert!(held[KEYFRAMES - 1] > most * 3 / 4, "the map stays as large as it may be: {held:?}");
+        assert!(gpu.peak_bytes() <= free.peak_bytes() * 7 / 10 || gpu.max_storage_bytes() == LARGEST);
+        let errors = (0..KEYFRAMES).map(|id| {
+            let Keyframe { image, .. } = elsewhere(id);
+            let rendered = mapper.render(&elsewhere(id).camera()).unwrap();
+            let error = image
+                .color
+                .pixels()
+                .zip(&rendered.color_depth)
+                .map(|(pixel, render)| (0..3).map(|k| (f32::from(pixel[k]) / 255.0 - render[k]).abs()).sum::<f32>() / 3.0);
+            error.sum::<f32>() / rendered.color_depth.len() as f32
+        });
+        let errors: Vec<f32> = errors.collect();
+        assert!(errors.iter().all(|error| *error < 0.1), "{errors:?} with {held:?}");
+        // A resumed map knows the room that it has.
+        let state = mapper.state(None).unwrap();
+        drop(mapper);
+        let mut resumed = Mapper::restore(gpu.clone(), &config, &state).unwrap();
+        (0..KEYFRAMES).for_each(|id| resumed.insert_again(&elsewhere(id), &state).unwrap());
+        assert!(resumed.insert(&elsewhere(KEYFRAMES), &|| false).unwrap().gaussians <= *most);
+    }
+}
+
 /// A camera may see nothing near at first: the map begins with the first keyframe that has depth.
 #[test]
 fn keyframes_before_the_first_depth_are_passed_over() {
@@ -70,7 +118,7 @@ fn keyframes_before_the_first_depth_are_passed_over() {
         assert_eq!(report, KeyframeReport { id, ..Default::default() });
         assert!(mapper.has_not_begun());
     }
-    assert_eq!(mapper.update_poses(&[(0, Se3::identity())]).unwrap(), 0);
+    assert_eq!(mapper.update_poses(&[PoseUpdate::rigid(0, Se3::identity())]).unwrap(), 0);
     // A checkpoint of a map that has not begun, or just has, is gone on from.
     let resume = |state: &MapperState, keyframes: &[Keyframe]| {
         let mut resumed = Mapper::restore(gpu.clone(), &config, state).unwrap();

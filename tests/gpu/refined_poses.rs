@@ -5,7 +5,7 @@ use std::sync::Arc;
 use image::{Rgb, RgbImage};
 use keysplat::geometry::{Pinhole, Se3, se3};
 use keysplat::gpu::Gpu;
-use keysplat::mapping::{DepthSource, Keyframe, Mapper, MappingConfig, RefinePosesConfig, RefinedPair};
+use keysplat::mapping::{DepthSource, Keyframe, Mapper, MappingConfig, PoseUpdate, RefinePosesConfig, RefinedPair};
 use keysplat::sequence::{DepthImage, RectifiedImage};
 use keysplat::splat::GaussianCloud;
 use nalgebra::{Point3, Vector3, Vector6};
@@ -64,7 +64,7 @@ fn refined(gpu: &Arc<Gpu>, refine_poses: RefinePosesConfig) -> (Vec<RefinedPair>
     let (pairs, map) = (mapper.refined(), mapper.download().unwrap());
     // The tracker moves all that it knows, as after a loop: refinements go along, and so do the Gaussians.
     let motion = se3::exp(&Vector6::new(0.5, -0.2, 0.1, 0.1, 0.3, -0.2));
-    let moved: Vec<_> = (0..KEYFRAMES).map(|id| (id, motion * tracked(id))).collect();
+    let moved: Vec<_> = (0..KEYFRAMES).map(|id| PoseUpdate::rigid(id, motion * tracked(id))).collect();
     assert_eq!(mapper.update_poses(&moved).unwrap(), map.len());
     for (before, after) in pairs.iter().zip(mapper.refined()) {
         let difference = before.keyframe_from_relative * after.keyframe_from_relative.inverse();

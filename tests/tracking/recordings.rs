@@ -3,7 +3,7 @@
 use image::{Rgb, RgbImage};
 use keysplat::geometry::{Camera, Distortion, Pinhole, Se3, StampedPose, se3};
 use keysplat::sequence::{DepthImage, Frame, Sensor, Sequence};
-use keysplat::tracking::{PoseMeasurement, TrackedFrame, Tracker, TrackingConfig, TrackingState};
+use keysplat::tracking::{KeyframeUpdate, PoseMeasurement, TrackedFrame, Tracker, TrackingConfig, TrackingState};
 use nalgebra::{Point3, Vector2, Vector3, Vector6};
 
 const CAMERA: Camera = Camera {
@@ -94,7 +94,7 @@ fn assert_within(estimate: &Se3, index: usize, max_metres: f64, max_angle_rad: f
 }
 
 /// What was said of each frame, and the updates that came at the end.
-type Answers = (Vec<TrackedFrame>, Vec<(usize, Se3)>);
+type Answers = (Vec<TrackedFrame>, Vec<KeyframeUpdate>);
 
 fn run(mut tracker: Tracker, frames: &[Frame]) -> (Tracker, Answers) {
     let tracked = frames.iter().map(|f| tracker.track(f, f.index % 8 != 4).unwrap()).collect();
@@ -107,10 +107,10 @@ fn run(mut tracker: Tracker, frames: &[Frame]) -> (Tracker, Answers) {
 fn assert_told(tracker: &Tracker, (tracked, last): &Answers) {
     let mut told = Vec::new();
     for t in tracked {
-        t.updates.iter().for_each(|(id, pose)| told[*id] = *pose);
+        t.updates.iter().for_each(|update| told[update.id] = update.world_from_camera);
         told.extend(t.keyframe.as_ref().map(|k| k.world_from_camera));
     }
-    last.iter().for_each(|(id, pose)| told[*id] = *pose);
+    last.iter().for_each(|update| told[update.id] = update.world_from_camera);
     assert_eq!(told, tracker.keyframes().iter().map(|k| k.world_from_camera).collect::<Vec<_>>());
 }
 
@@ -124,7 +124,7 @@ fn a_walk_through_a_textured_room_is_recovered_the_same_each_time() {
         assert!(t.keyframe.is_none() || index % 8 != 4, "frame {index} is held out");
         if let Some(keyframe) = &t.keyframe {
             assert!(keyframe.covisible.is_sorted_by(|a, b| a.1 >= b.1));
-            assert!(t.updates.iter().all(|(id, _)| *id < keyframe.id));
+            assert!(t.updates.iter().all(|update| update.id < keyframe.id && update.scale == 1.0));
         }
     }
     let trajectory = tracker.trajectory();

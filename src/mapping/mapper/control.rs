@@ -8,7 +8,7 @@ use crate::optimise::{AdamConfig, ErrorPixels, GaussianScore};
 impl Mapper {
     /// Whether, and by what, Gaussians are scored: for control of their density, or to know which to give up.
     pub(super) fn scoring(&self, density: &DensityConfig) -> Option<ErrorPixels> {
-        let wanted = density.strategy != DensityStrategy::None || self.config.limits.limits_gaussians();
+        let wanted = density.strategy != DensityStrategy::None || self.is_limited();
         wanted.then(|| density.error_pixels())
     }
 
@@ -26,7 +26,10 @@ impl Mapper {
         let histories = self.stats.histories();
         let candidates: Vec<Candidate> =
             (0..self.cloud.len()).map(|i| Candidate { geometry: geometry[i], score: scores[i], history: histories[i] }).collect();
-        let plan = density::plan(&candidates, self.most_gaussians(), density);
+        let mut plan = density::plan(&candidates, self.most_gaussians(), density);
+        if self.probe(plan.len()) {
+            plan = density::plan(&candidates, self.most_gaussians(), density);
+        }
         let (before, children) = (self.cloud.len(), plan.children.len());
         self.cloud.apply(&self.gpu, &plan)?;
         self.stats.apply(&plan);

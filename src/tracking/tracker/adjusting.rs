@@ -8,12 +8,12 @@
 use std::time::Instant;
 
 use super::{Tracker, milliseconds};
-use crate::geometry::Se3;
 use crate::sequence::Sensor;
 use crate::tracking::adjustment::local_bundle::Adjustment;
 use crate::tracking::adjustment::thread::Worker;
+use crate::tracking::loop_closing::MovedKeyframe;
 use crate::tracking::map::keyframe_culling::cull_around;
-use crate::tracking::{PoseMeasurement, StageTimes, TrackingError};
+use crate::tracking::{KeyframeUpdate, PoseMeasurement, StageTimes, TrackingError};
 
 /// Deterministic replay: frames after its keyframe at which an adjustment is taken in, at most, and as a share of those since the keyframe before:
 /// where keyframes follow each other closely the map must not lag behind. Points that were only triangulated are poor until they are
@@ -57,11 +57,11 @@ impl Adjusting {
 
 impl Tracker {
     /// Waits for all that is under way and takes it in: to be called when no frame is left. Returns the keyframes that moved since the
-    /// last frame: id, new world_from_camera.
+    /// last frame.
     ///
     /// # Errors
     /// [`TrackingError::Adjusting`] if the adjustment panicked.
-    pub fn finish(&mut self) -> Result<Vec<(usize, Se3)>, TrackingError> {
+    pub fn finish(&mut self) -> Result<Vec<KeyframeUpdate>, TrackingError> {
         self.take_all_adjusted(&mut StageTimes::default())?;
         Ok(self.updates())
     }
@@ -118,7 +118,7 @@ impl Tracker {
     fn take_in(&mut self, under_way: UnderWay, solved: &Adjustment, times: &mut StageTimes) -> Result<(), TrackingError> {
         let clock = Instant::now();
         self.adjusting.under_way = None;
-        self.moved.extend(solved.apply(&mut self.map, &self.rig.config));
+        solved.apply(&mut self.map, &self.rig.config).into_iter().for_each(|k| self.note_move(k, 1.0));
         times.bundle_ms += milliseconds(clock);
         if let Some(keyframe) = under_way.around {
             self.close_loops_and_cull(keyframe, times)?;
@@ -175,7 +175,7 @@ impl Tracker {
             return false;
         }
         let moved = self.loops.close(&mut self.map, keyframe, &self.rig);
-        for crate::tracking::loop_closing::MovedKeyframe { keyframe, growth } in &moved {
+        for MovedKeyframe { keyframe, growth } in &moved {
             let theirs = self.records.iter_mut().filter(|r| r.reference == *keyframe);
             theirs.for_each(|r| r.camera_from_reference.translation.vector *= *growth);
             if *keyframe == self.motion.reference
@@ -183,8 +183,8 @@ impl Tracker {
             {
                 velocity.translation.vector *= *growth;
             }
+            self.note_move(*keyframe, *growth);
         }
-        self.moved.extend(moved.iter().map(|m| m.keyframe));
         self.follow_keyframe();
         !moved.is_empty()
     }
@@ -201,9 +201,61 @@ impl Tracker {
         }
     }
 
-    /// Keyframes that moved since the last call: id, new world_from_camera.
-    pub(super) fn updates(&mut self) -> Vec<(usize, Se3)> {
-        let pose = |k: usize| self.map.keyframes[k].camera_from_world.inverse();
-        std::mem::take(&mut self.moved).into_iter().map(|k| (k, pose(k))).collect()
+    /// A keyframe moved, and lengths around it grew by a factor.
+    fn note_move(&mut self, keyframe: usize, growth: f64) {
+        *self.moved.entry(keyframe).or_insert(1.0) *= growth;
+    }
+
+    /// Keyframes that moved since the last call.
+    pub(super) fn updates(&mut self) -> Vec<KeyframeUpdate> {
+        let pose = |id: usize| self.map.keyframes[id].camera_from_world.inverse();
+        let moved = std::mem::take(&mut self.moved).into_iter();
+        moved.map(|(id, scale)| KeyframeUpdate { id, world_from_camera: pose(id), scale }).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::sim3::{self, Vector7};
+    use crate::geometry::{Camera, Distortion};
+    use crate::tracking::TrackingConfig;
+    use crate::tracking::loop_closing::tests::drifted;
+    use crate::tracking::solvers::residual::tests::PINHOLE;
+
+    #[test]
+    fn the_scale_of_a_loop_without_depth_goes_out_with_the_poses() {
+        let config = TrackingConfig::default();
+        let step = sim3::exp(&Vector7::from_column_slice(&[0.004, 0.001, -0.003, 0.001, 0.003, 0.0005, 0.004]));
+        let camera = Camera { pinhole: PINHOLE, distortion: Distortion::default(), depth_units_per_metre: 5000.0 };
+        let mut tracker = Tracker::new(camera, Sensor::Mono, &config).unwrap();
+        tracker.map = drifted(&step, false, &config);
+        let newest = tracker.map.keyframes.len() - 1;
+        // Landmarks of each keyframe that it saw first, and their depths, metres.
+        let depths = |tracker: &Tracker| -> Vec<Vec<(usize, f64)>> {
+            let depth = |k: usize, l: usize| (tracker.map.keyframes[k].camera_from_world * tracker.map.landmarks[l].position).z;
+            let own = |k: &usize, l: &usize| tracker.map.landmarks[*l].observations.first().is_some_and(|o| o.keyframe == *k);
+            let seen = |k: usize| tracker.map.keyframes[k].landmarks.iter().flatten().copied().filter(move |l| own(&k, l));
+            (0..=newest).map(|k| seen(k).map(|l| (l, depth(k, l))).collect()).collect()
+        };
+        let before = depths(&tracker);
+        assert!(tracker.close_loop(newest));
+        tracker.note_move(3, 2.0);
+        let after = depths(&tracker);
+        let updates = tracker.updates();
+        assert_eq!(updates.iter().map(|u| u.id).collect::<Vec<_>>(), (1..=newest).collect::<Vec<_>>());
+        assert!(tracker.updates().is_empty());
+        // Lengths had shrunk to 1/1.21 since the place was first seen, a round before.
+        assert!((1.1..1.3).contains(&updates[newest - 1].scale), "{}", updates[newest - 1].scale);
+        for KeyframeUpdate { id, world_from_camera, scale } in updates {
+            assert_eq!(world_from_camera, tracker.map.keyframes[id].camera_from_world.inverse());
+            let scale = if id == 3 { scale / 2.0 } else { scale };
+            let landmarks = before[id].iter().filter_map(|(l, z)| Some(after[id].iter().find(|a| a.0 == *l)?.1 / z));
+            let mut growths: Vec<f64> = landmarks.collect();
+            growths.sort_by(f64::total_cmp);
+            if let Some(median) = growths.get(growths.len() / 2) {
+                assert!((median / scale - 1.0).abs() < 1e-6, "keyframe {id}: {scale}, landmarks {median}");
+            }
+        }
     }
 }

@@ -8,7 +8,7 @@ mod dense_fallback;
 mod keyframe_selection;
 mod start;
 
-use std::collections::BTreeSet;
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -55,8 +55,8 @@ pub struct Tracker {
     frames_seen: usize,
     records: Vec<Record>,
     adjusting: Adjusting,
-    /// Keyframes that moved since the last tracked frame.
-    moved: BTreeSet<usize>,
+    /// Keyframes that moved since the last tracked frame, and the factor by which lengths around each have grown.
+    moved: BTreeMap<usize, f64>,
 }
 
 /// The last pose and the constant-velocity motion model.
@@ -131,7 +131,7 @@ impl Tracker {
             frames_seen: 0,
             records: Vec::new(),
             adjusting: Adjusting::new(worker),
-            moved: BTreeSet::new(),
+            moved: BTreeMap::new(),
         })
     }
 
@@ -328,7 +328,7 @@ impl Tracker {
         self.record(frame, id, Se3::identity());
         self.motion.last = Some(LastFrame { features, camera_from_world, landmarks: self.map.keyframes[id].landmarks.clone() });
         self.adjust_around(id, held, times)?;
-        // Its pose goes out with itself.
+        // Its pose and its landmarks' depths go out with itself.
         self.moved.remove(&id);
         Ok(Some(self.describe(id)))
     }

@@ -1,0 +1,91 @@
+//! What the mapper holds, within its limits and those of the adapter: Gaussians of least contribution go first, and so do images of
+//! keyframes between near neighbours.
+
+use super::Mapper;
+use crate::gpu::GpuError;
+use crate::mapping::keyframe::MappedKeyframe;
+use crate::mapping::{Keyframe, LimitsConfig, MappingError, insertion, limits};
+use crate::render::{Plan, Rendered};
+use crate::splat::Exposure;
+
+impl Mapper {
+    /// The keyframe with its image on the GPU. Where there is no memory for it, images of earlier ones leave the GPU.
+    pub(super) fn upload(&mut self, keyframe: &Keyframe, exposure: Exposure) -> Result<MappedKeyframe, MappingError> {
+        loop {
+            let uploaded = MappedKeyframe::new(&self.gpu, keyframe, exposure, self.config.learns_at_half_size());
+            let full = matches!(uploaded, Err(GpuError::OutOfMemory(_)));
+            match limits::least_needed_keyframe(&self.keyframes, self.config.window.recent).filter(|_| full) {
+                Some(k) => self.keyframes[k].offload(&self.gpu, &mut self.images)?,
+                None => return Ok(uploaded?),
+            }
+        }
+    }
+
+    /// Images beyond their number leave the GPU.
+    pub(super) fn limit_gpu_images(&mut self) -> Result<(), MappingError> {
+        let most = self.config.limits.gpu_images(self.largest_image_bytes());
+        let mut resident = self.keyframes.iter().filter(|k| k.is_resident()).count();
+        while resident > most
+            && let Some(k) = limits::least_needed_keyframe(&self.keyframes, self.config.window.recent)
+        {
+            self.keyframes[k].offload(&self.gpu, &mut self.images)?;
+            resident -= 1;
+        }
+        Ok(())
+    }
+
+    pub(super) fn insert_gaussians(&mut self, keyframe: &Keyframe, rendered: Option<&Rendered>) -> Result<usize, MappingError> {
+        if keyframe.image.depth.is_none() {
+            return Ok(0);
+        }
+        let mut new = insertion::gaussians(keyframe, rendered, &self.config.insertion, self.config.sh_degree);
+        let limited = self.config.limits.limits_gaussians();
+        if limited {
+            self.cloud.limit(self.most_gaussians());
+        }
+        if self.probe(self.cloud.len() + new.len()) || limited {
+            let most = self.most_gaussians();
+            new = new.thinned(limits::insertions_allowed(new.len(), most));
+            let scored_age = self.config.density.every as u32;
+            let keep = limits::largest_contributions(self.stats.histories(), most - new.len(), scored_age);
+            let plan = Plan::keeping(keep);
+            self.cloud.apply(&self.gpu, &plan)?;
+            self.stats.apply(&plan);
+        }
+        let left_out = self.cloud.append(&self.gpu, &new)?;
+        self.stats.append(keyframe.id, new.len() - left_out);
+        Ok(new.len())
+    }
+
+    /// How many Gaussians there may be, at present, when there is to be room for one more keyframe's image.
+    pub(super) fn most_gaussians(&self) -> usize {
+        let other =
+            LimitsConfig::other_bytes(self.gpu.bytes() + self.largest_image_bytes(), self.cloud.bytes(), self.cloud.capacity());
+        self.config.limits.gaussians(self.cloud.bytes_each(), other).min(self.cloud.most(&self.gpu))
+    }
+
+    /// Bytes on the GPU of the largest keyframe's image.
+    fn largest_image_bytes(&self) -> u64 {
+        self.keyframes.iter().map(MappedKeyframe::image_bytes).max().unwrap_or(0)
+    }
+
+    /// Whether the number of Gaussians is limited: by the configuration, or because the map fills the adapter.
+    pub(super) fn is_limited(&self) -> bool {
+        self.config.limits.limits_gaussians() || self.cloud.capacity() >= self.cloud.most(&self.gpu)
+    }
+
+    /// Before the map grows to `wanted` Gaussians: whether that is more than the adapter has room for, which is reported once.
+    pub(super) fn probe(&mut self, wanted: usize) -> bool {
+        self.cloud.probe(&self.gpu, wanted.min(self.most_gaussians()), limits::SCRATCH_BYTES_EACH + limits::LIST_BYTES_EACH);
+        let most = self.cloud.most(&self.gpu);
+        let full = wanted > most;
+        if full && !self.is_full {
+            tracing::warn!(
+                "the adapter has room for {most} Gaussians; the map goes on within it, and those of least contribution go first. \
+                 --max-gaussians or --max-gpu-memory bounds the map before that"
+            );
+        }
+        self.is_full |= full;
+        full
+    }
+}
