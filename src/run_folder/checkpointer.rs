@@ -145,7 +145,7 @@ mod tests {
     use super::*;
     use crate::config::Config;
     use crate::geometry::Se3;
-    use crate::mapping::MapperState;
+    use crate::mapping::{MapperState, PoseUpdate};
     use crate::synthetic::{self, CameraConfig, SceneConfig};
 
     fn checkpointer(every: usize, resume_from: Option<RunState>) -> Checkpointer {
@@ -179,7 +179,7 @@ mod tests {
 
     #[test]
     fn what_the_mapper_receives_is_in_the_digest() {
-        let message = MapperMessage::PoseUpdate(vec![(1, Se3::translation(0.5, 0.0, 0.0))]);
+        let message = MapperMessage::PoseUpdate(vec![PoseUpdate::rigid(1, Se3::translation(0.5, 0.0, 0.0))]);
         let (mut run, mut digest) = (checkpointer(1, None), MessageDigest::default());
         run.received(&message);
         digest.update(&message);
