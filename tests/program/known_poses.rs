@@ -171,7 +171,7 @@ fn masked_pixels_are_neither_mapped_nor_measured() {
     }
     let photos = transforms("masked");
     let m = metrics(&run("of-masked", &photos));
-    let held_out = m.images.held_out.clone().unwrap();
+    let held_out = m.images.held_out.unwrap();
     assert!(held_out.psnr_db.unwrap() > 22.0 && held_out.depth_l1_m.unwrap() < 0.1, "{m}");
     let text = std::fs::read_to_string(photos.join("transforms.json")).unwrap();
     std::fs::write(photos.join("transforms.json"), text.replace("mask_path", "no_mask_path")).unwrap();
