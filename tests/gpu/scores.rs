@@ -35,13 +35,8 @@ fn scores_are_those_of_their_definition() {
         let wrong: Vec<bool> = errors.iter().map(|e| *e > threshold).collect();
         let clear_cut = errors.iter().all(|e| (e - threshold).abs() > 1e-4);
         let weights = LossWeights { ssim: f64::from(loss_config.ssim_weight), depth: 0.0, precise_depth: 1.0, phase: [0, 0] };
-        let target = Target64 {
-            width: width as usize,
-            height: height as usize,
-            color,
-            depth: vec![0.0; errors.len()],
-            valid: vec![true; errors.len()],
-        };
+        let ([width, height], pixels) = ([width as usize, height as usize], errors.len());
+        let target = Target64 { width, height, color, depth: vec![0.0; pixels], valid: vec![true; pixels] };
         let (total, by_image) = loss(&rendered, &target, &weights);
         let expected = scores(&view, &cloud_64, &by_image, &wrong);
 
@@ -72,11 +67,8 @@ fn scores_are_those_of_their_definition() {
         compare("metres per pixel", found.iter().map(|s| s.metres_per_pixel).collect(), size);
         clear_cuts += usize::from(clear_cut);
         if clear_cut {
-            compare(
-                "wrong pixels",
-                found.iter().map(|s| s.error_pixels).collect(),
-                expected.iter().map(|s| 2.0 * s.error_pixels).collect(),
-            );
+            let wrong = expected.iter().map(|s| 2.0 * s.error_pixels).collect();
+            compare("wrong pixels", found.iter().map(|s| s.error_pixels).collect(), wrong);
             let weighted = expected.iter().map(|s| 2.0 * s.error_pixels * total).collect();
             compare("weighted wrong pixels", found.iter().map(|s| s.weighted_error_pixels).collect(), weighted);
         }
