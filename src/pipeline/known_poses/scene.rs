@@ -26,6 +26,8 @@ const SAMPLED_POINTS: usize = 2000;
 const MOST_VIEWS: usize = 500;
 /// Features of a frame, at least: photos are further apart than the frames that tracking matches, and share fewer.
 const FEATURES: usize = 4000;
+/// Noise of keypoints as a share of `tracking.pixel_sigma`, which allows for poses that are still to be found.
+const PIXEL_SIGMA_SHARE: f64 = 0.5;
 /// Frames decoded side by side.
 const BATCH: usize = 8;
 /// Triangulated points that are a scene.
@@ -137,7 +139,11 @@ fn triangulate(recording: &Recording, progress: &Progress) -> Result<BTreeMap<us
     let mut frames: Vec<(usize, Se3)> = sequence.entries.iter().enumerate().filter_map(posed).collect();
     frames.retain(|(index, _)| !config.replay.is_held_out(*index));
     let frames: Vec<(usize, Se3)> = frames.iter().step_by(frames.len().div_ceil(MOST_VIEWS).max(1)).copied().collect();
-    let tracking = TrackingConfig { features: config.tracking.features.max(FEATURES), ..config.tracking.clone() };
+    let tracking = TrackingConfig {
+        features: config.tracking.features.max(FEATURES),
+        pixel_sigma: PIXEL_SIGMA_SHARE * config.tracking.pixel_sigma,
+        ..config.tracking.clone()
+    };
     tracing::info!("no points: triangulating them from {} frames", frames.len());
     let (mut indices, mut views) = (Vec::new(), Vec::new());
     for batch in frames.chunks(BATCH).take_while(|_| !progress.stopped()) {
