@@ -17,7 +17,7 @@ use crate::render::BlendForm;
 pub enum Preset {
     /// Keep up with the recording's own frame rate: resolution and steps follow from the adapter's speed.
     Realtime,
-    /// A third of the default's steps.
+    /// Few steps: 3 a keyframe, and 6 epochs at the end.
     Draft,
     /// The defaults.
     Balanced,

@@ -237,8 +237,6 @@ pub struct RefineConfig {
     pub density_every: usize,
     /// by the scores of so many keyframes, evenly spread over all.
     pub density_views: usize,
-    /// A view whose colour error falls by less than this share from one epoch to the next rests for some epochs; 0: none does.
-    pub min_gain: f32,
     /// Share of the steps after which the map grows no more.
     pub growth_share: f32,
     /// Share of the steps, the first ones, that see the images at half size.
@@ -276,7 +274,6 @@ impl Default for RefineConfig {
             all_tiles: true,
             density_every: 200,
             density_views: 10,
-            min_gain: 0.01,
             growth_share: 0.65,
             half_size_share: 0.0,
             final_lr_scale_position: 0.02,
@@ -380,7 +377,6 @@ impl MappingConfig {
         self.limits.validate().map_err(|e| format!("mapping.limits: {e}"))?;
         let closed_shares = [
             ("refine.growth_share", self.refine.growth_share),
-            ("refine.min_gain", self.refine.min_gain),
             ("refine.half_size_share", self.refine.half_size_share),
             ("window.final_lr_scale", self.window.final_lr_scale),
         ];

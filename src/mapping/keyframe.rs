@@ -288,12 +288,13 @@ impl MappedKeyframe {
 
     /// Training view; the smaller image if `coarse` and there is one. An offloaded image is still to be streamed.
     pub fn view(&self, coarse: bool) -> TrainingView<'_> {
-        match self.image.half.as_ref().filter(|_| coarse) {
-            None => TrainingView { exposure: self.exposure, ..TrainingView::new(self.camera, &self.image.whole) },
+        let view = match self.image.half.as_ref().filter(|_| coarse) {
+            None => TrainingView::new(self.camera, &self.image.whole),
             Some(target) => {
-                let camera = ViewCamera { pinhole: halved_pinhole(&self.camera.pinhole), ..self.camera };
-                TrainingView { exposure: self.exposure, ..TrainingView::new(camera, target) }
+                let pinhole = halved_pinhole(&self.camera.pinhole);
+                TrainingView::new(ViewCamera { pinhole, ..self.camera }, target)
             }
-        }
+        };
+        TrainingView { exposure: self.exposure, ..view }
     }
 }

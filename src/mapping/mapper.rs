@@ -1,6 +1,7 @@
 //! The mapper: owns the Gaussians, their moments and the keyframe window.
 
 mod control;
+mod exposures;
 mod refine;
 mod relative_poses;
 mod state;
@@ -23,7 +24,7 @@ use super::keyframe::{DepthSource, MappedKeyframe};
 use super::plane_sweep::{self, SourceView};
 use super::refine_poses::RefinedPair;
 use super::schedule::{self, Session, Step};
-use super::{ExposureConfig, Keyframe, KeyframeId, MappingConfig, MappingError, PoseUpdate, exposure, initialise_from_points};
+use super::{Keyframe, KeyframeId, MappingConfig, MappingError, PoseUpdate, exposure, initialise_from_points};
 use crate::geometry::Se3;
 use crate::gpu::Gpu;
 use crate::optimise::{AdamConfig, ErrorPixels, StepReport, TileSampling, Trainer, TrainingView};
@@ -244,34 +245,6 @@ impl Mapper {
         (0..depth.metres.len()).filter(|&i| !image.is_valid(i)).for_each(|i| depth.metres[i] = 0.0);
         let image = RectifiedImage { depth: Some(depth), ..image.clone() };
         Some(Keyframe { image, ..keyframe.clone() })
-    }
-
-    /// The exposure of an image of which the map shows `rendered`. A map that no step has moved yet shows nothing that counts.
-    fn exposure(&self, image: &RectifiedImage, rendered: Option<&Rendered>) -> Exposure {
-        let (config, last) = (&self.config.exposure, self.keyframes.last().map_or(Exposure::default(), |k| k.exposure));
-        let shown = rendered.filter(|_| config.enabled && self.is_trained());
-        shown.map_or(last, |rendered| exposure::measure(exposure::recorded(image), rendered, &last, config))
-    }
-
-    /// Measures all keyframes' exposures against the map, whose own becomes their mean.
-    fn measure_exposures(&mut self) -> Result<(), MappingError> {
-        // The mean holds the map's exposure, so that nothing has to be given up.
-        let config = ExposureConfig { pull: 0.0, ..self.config.exposure.clone() };
-        let mut measured = Vec::with_capacity(self.keyframes.len());
-        for k in 0..self.keyframes.len() {
-            let rendered = self.render(&self.keyframes[k].camera.clone())?;
-            let keyframe = &self.keyframes[k];
-            let pixels = keyframe.pixels(&self.gpu, &self.images)?;
-            measured.push(exposure::measure(exposure::recorded_pixels(&pixels), &rendered, &keyframe.exposure, &config));
-        }
-        exposure::center(&mut measured);
-        self.keyframes.iter_mut().zip(measured).for_each(|(keyframe, exposure)| keyframe.exposure = exposure);
-        Ok(())
-    }
-
-    /// Exposures of the keyframes against the map's, in the order of their arrival.
-    pub fn exposures(&self) -> impl Iterator<Item = (KeyframeId, Exposure)> {
-        self.keyframes.iter().map(|keyframe| (keyframe.id, keyframe.exposure))
     }
 
     /// Steps over the window until all are taken or nothing more is gained; on the way some of them score the Gaussians, whose density is

@@ -204,11 +204,7 @@ impl MapThread<'_> {
         let mut refinement = begun.unwrap_or(first);
         while let Some(report) = mapper.refine(&mut refinement, &|| self.progress.stopped())? {
             tracing::debug!(?report, "refined");
-            let exposures: BTreeMap<KeyframeId, Exposure> = mapper.exposures().collect();
-            let exposed = |record: &mut KeyframeRecord| {
-                exposures.get(&record.report.id).into_iter().for_each(|exposure| record.report.exposure = *exposure);
-            };
-            summary.keyframes.iter_mut().for_each(exposed);
+            summary.expose(&mapper.exposures().collect());
             summary.publish(Some(Arc::new(mapper.download()?)), report.psnr_db, self.progress);
             on_round(Round { cloud: &summary.cloud, steps: mapper.step_times().len() });
             if !self.progress.stopped() {
@@ -291,6 +287,13 @@ struct Processed {
 }
 
 impl MapSummary {
+    /// Takes in the exposures of keyframes.
+    fn expose(&mut self, exposures: &BTreeMap<KeyframeId, Exposure>) {
+        for KeyframeRecord { report, .. } in &mut self.keyframes {
+            report.exposure = exposures.get(&report.id).copied().unwrap_or(report.exposure);
+        }
+    }
+
     fn publish(&mut self, changed: Option<Arc<GaussianCloud>>, psnr_db: f32, progress: &Progress) {
         let Some(cloud) = changed else { return };
         self.cloud = cloud.clone();

@@ -15,10 +15,10 @@ use crate::splat::{GaussianCloud, ShDegree};
 
 /// Parameters, first and second moments, averages.
 const BUFFERS: usize = 4;
-/// Memory is full when less than this share of what growth needs would be left, for scratch that follows the views.
-const MARGIN: u64 = 4;
-/// The map does not grow by less than this share of itself.
-const LEAST_GROWTH: usize = 8;
+/// Growth needs a quarter more memory than it takes: scratch follows the views.
+const MARGIN_DIVISOR: u64 = 4;
+/// The map grows by an eighth of itself at least.
+const LEAST_GROWTH_DIVISOR: usize = 8;
 
 /// Gaussians on the GPU, `[planes, capacity]` vec4 in each buffer. Plane 0 holds position and raw opacity, 1 the log scale,
 /// 2 the rotation (w, x, y, z), 3 the constant colour, 4… the other harmonics, RGB each.
@@ -123,11 +123,11 @@ impl GpuCloud {
         let (own, each, bytes) = (self.capacity, self.bytes_each(), self.bytes());
         let has_room = |capacity: usize| {
             let missing = (capacity as u64 * each + (capacity - own) as u64 * scratch_bytes).saturating_sub(bytes);
-            gpu.has_room(missing + missing / MARGIN)
+            gpu.has_room(missing + missing / MARGIN_DIVISOR)
         };
         while capacity > self.capacity && !has_room(capacity) {
             let less = (capacity - self.capacity) / 2;
-            capacity = self.capacity + if less > self.capacity / LEAST_GROWTH { less } else { 0 };
+            capacity = self.capacity + if less > self.capacity / LEAST_GROWTH_DIVISOR { less } else { 0 };
             self.room = Some(capacity);
         }
     }

@@ -7,7 +7,7 @@ use std::time::Instant;
 
 use serde::{Deserialize, Serialize};
 
-use crate::mapping::{DensityConfig, ExposureConfig, MappingError, RefineConfig};
+use crate::mapping::{DensityConfig, MappingError, RefineConfig};
 use crate::optimise::{AdamConfig, StepReport};
 
 use super::{BATCH, Mapper, Step};
@@ -24,44 +24,12 @@ pub struct FinalRefinement {
     done: usize,
     /// Keyframes left of this epoch.
     epoch: Vec<usize>,
-    /// `[keyframes]` see [`Plateau`].
-    plateaus: Vec<Plateau>,
     rounds: usize,
     /// Measurements of the exposures so far.
-    exposed: usize,
+    pub(super) exposed: usize,
     /// A refinement of so many seconds has no checkpoint.
     #[serde(skip)]
     started: Option<Instant>,
-}
-
-/// Whether a view has reached its plateau: then it rests for some epochs.
-#[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
-struct Plateau {
-    /// Colour error at its last step; 0 before.
-    l1: f32,
-    /// Epochs that it rests next time,
-    rest: u32,
-    /// and that are left now.
-    left: u32,
-}
-
-/// A view on its plateau rests no longer than this, in epochs: its neighbours' steps move it.
-const MAX_REST: u32 = 4;
-
-impl Plateau {
-    /// Takes note of a step's error: one that fell by less than a share of itself doubles the rest.
-    fn visited(&mut self, l1: f32, min_gain: f32) {
-        let gains = self.l1 == 0.0 || l1 < (1.0 - min_gain) * self.l1;
-        self.rest = if gains { 0 } else { (2 * self.rest).clamp(1, MAX_REST) };
-        (self.l1, self.left) = (l1, self.rest);
-    }
-
-    /// Whether it takes part in the next epoch.
-    fn is_due(&mut self) -> bool {
-        let due = self.left == 0;
-        self.left = self.left.saturating_sub(1);
-        due
-    }
 }
 
 /// Result of a refinement round.
@@ -81,7 +49,7 @@ pub struct RefineReport {
 
 impl FinalRefinement {
     /// Share of the steps, or of the time, that is spent; 1 at the end.
-    fn progress(&self) -> f32 {
+    pub(super) fn progress(&self) -> f32 {
         match (self.config.seconds, self.started) {
             (Some(seconds), Some(started)) => (started.elapsed().as_secs_f64() / seconds.max(f64::MIN_POSITIVE)).min(1.0) as f32,
             _ if self.config.steps == 0 => 1.0,
@@ -160,16 +128,7 @@ impl Mapper {
             None => config.steps.max(config.final_epochs * self.views().len()),
         };
         let started = config.seconds.map(|_| Instant::now());
-        Ok(FinalRefinement {
-            adam: self.config.adam.clone(),
-            config,
-            done: 0,
-            epoch: Vec::new(),
-            plateaus: Vec::new(),
-            rounds: 0,
-            exposed: 0,
-            started,
-        })
+        Ok(FinalRefinement { adam: self.config.adam.clone(), config, done: 0, epoch: Vec::new(), rounds: 0, exposed: 0, started })
     }
 
     /// The steps up to the next density control, and that; `None` when all are done, or `stop` says so.
@@ -192,47 +151,27 @@ impl Mapper {
         let end = steps.min(refinement.done + density_every);
         while refinement.done < end && !refinement.is_done() && !stop() {
             let coarse = refinement.progress() < half_size_share;
-            let keyframes = self.draw_from(refinement, BATCH.min(end - refinement.done));
+            let keyframes: Vec<usize> =
+                (refinement.done..end.min(refinement.done + BATCH)).map(|_| self.draw_from(refinement)).collect();
             let batch: Vec<Step> = keyframes.into_iter().map(|keyframe| Step { keyframe, coarse, lr_scale: 1.0 }).collect();
             adam = refinement.rates();
-            for (step, report) in batch.iter().zip(self.consolidation_steps(&batch, &adam)?) {
-                refinement.plateaus[step.keyframe].visited(report.loss.l1, refinement.config.min_gain);
+            for report in self.consolidation_steps(&batch, &adam)? {
                 psnr = (psnr.0 + report.loss.psnr_db(), psnr.1 + 1);
             }
             refinement.done += batch.len();
         }
-        self.expose(refinement)?;
+        self.refine_exposures(refinement)?;
         let (pruned, grown) = if !refinement.is_done() { self.score_and_control(refinement, &density, &adam)? } else { (0, 0) };
         let psnr_db = psnr.0 / psnr.1.max(1) as f32;
         Ok(Some(RefineReport { steps_done: refinement.done, pruned, grown, gaussians: self.cloud.len(), psnr_db }))
     }
 
-    /// Measures the exposures if that is due: so many times in the first half, at equal distances.
-    fn expose(&mut self, refinement: &mut FinalRefinement) -> Result<(), MappingError> {
-        let ExposureConfig { enabled, refinements, .. } = self.config.exposure;
-        let due = (refinement.exposed + 1) as f32 / (2 * refinements.max(1)) as f32;
-        if enabled && refinement.exposed < refinements && refinement.progress() >= due {
-            refinement.exposed += 1;
-            self.measure_exposures()?;
+    fn draw_from(&mut self, refinement: &mut FinalRefinement) -> usize {
+        if refinement.epoch.is_empty() {
+            refinement.epoch = self.views();
+            self.rng.shuffle(&mut refinement.epoch);
         }
-        Ok(())
-    }
-
-    /// At most so many keyframes of one epoch: the next one begins when all losses of this one are known.
-    fn draw_from(&mut self, refinement: &mut FinalRefinement, most: usize) -> Vec<usize> {
-        while refinement.epoch.is_empty() {
-            let mut views = self.views();
-            let all = views.len();
-            refinement.plateaus.resize(all, Plateau::default());
-            if refinement.config.min_gain > 0.0 {
-                views.retain(|view| refinement.plateaus[*view].is_due());
-                // Views that rest count as stepped on.
-                refinement.done += all - views.len();
-            }
-            self.rng.shuffle(&mut views);
-            refinement.epoch = views;
-        }
-        refinement.epoch.split_off(refinement.epoch.len().saturating_sub(most))
+        refinement.epoch.pop().unwrap_or_default()
     }
 
     /// Density control by views spread over all keyframes, others in each round.

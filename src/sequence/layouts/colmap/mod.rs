@@ -2,7 +2,8 @@
 //!
 //! `images/` beside `sparse/0/` (or `sparse/`) with `cameras`, `images` and `points3D`, each `.bin` or `.txt`. The poses are known: they
 //! become the truth, and the points with their colours seed a map. Photos have no times: sorted by name, the n-th listed one has the
-//! timestamp of n seconds. Up to half of them may be missing. COLMAP's pixels count from the image's corner, ours from the first pixel's centre: principal points move by half a pixel.
+//! timestamp of n seconds. Up to half of them may be missing. COLMAP's pixels count from the image's corner, ours from the first pixel's
+//! centre: principal points move by half a pixel.
 //!
 //! Left out: fisheye lenses, which are refused.
 

@@ -1,0 +1,44 @@
+//! Exposures of the keyframes: measured on arrival, and again in the final refinement where photos arrive before there is a map.
+
+use super::{FinalRefinement, Mapper};
+use crate::mapping::{ExposureConfig, KeyframeId, MappingError, exposure};
+use crate::render::Rendered;
+use crate::sequence::RectifiedImage;
+use crate::splat::Exposure;
+
+impl Mapper {
+    /// Exposures of the keyframes against the map's, in the order of their arrival.
+    pub fn exposures(&self) -> impl Iterator<Item = (KeyframeId, Exposure)> {
+        self.keyframes.iter().map(|keyframe| (keyframe.id, keyframe.exposure))
+    }
+
+    /// The exposure of an image of which the map shows `rendered`. A map that no step has moved yet shows nothing that counts.
+    pub(super) fn exposure(&self, image: &RectifiedImage, rendered: Option<&Rendered>) -> Exposure {
+        let (config, last) = (&self.config.exposure, self.keyframes.last().map_or(Exposure::default(), |k| k.exposure));
+        let shown = rendered.filter(|_| config.enabled && self.is_trained());
+        shown.map_or(last, |rendered| exposure::measure(exposure::recorded(image), rendered, &last, config))
+    }
+
+    /// Measures all exposures if that is due: so many times in the first half of a refinement, at equal distances.
+    pub(super) fn refine_exposures(&mut self, refinement: &mut FinalRefinement) -> Result<(), MappingError> {
+        let ExposureConfig { enabled, refinements, .. } = self.config.exposure;
+        let due = (refinement.exposed + 1) as f32 / (2 * refinements.max(1)) as f32;
+        if !enabled || refinement.exposed >= refinements || refinement.progress() < due {
+            return Ok(());
+        }
+        refinement.exposed += 1;
+        // The mean becomes the map's exposure, so that nothing has to be given up.
+        let config = ExposureConfig { pull: 0.0, ..self.config.exposure.clone() };
+        let mut measured = Vec::with_capacity(self.keyframes.len());
+        for k in 0..self.keyframes.len() {
+            let camera = self.keyframes[k].camera;
+            let rendered = self.render(&camera)?;
+            let keyframe = &self.keyframes[k];
+            let pixels = keyframe.pixels(&self.gpu, &self.images)?;
+            measured.push(exposure::measure(exposure::recorded_pixels(&pixels), &rendered, &keyframe.exposure, &config));
+        }
+        exposure::center(&mut measured);
+        self.keyframes.iter_mut().zip(measured).for_each(|(keyframe, exposure)| keyframe.exposure = exposure);
+        Ok(())
+    }
+}
