@@ -1,24 +1,14 @@
-// Carries the intersections' gradients through the projection to each visible Gaussian's parameters, and to the camera pose.
+// Carries the intersections' gradients through the projection to each visible Gaussian's parameters.
 //
 // One invocation a visible Gaussian, in map order: neighbours' parameters lie side by side. A Gaussian's intersections do as well, and are summed
 // in order. `begin_gradient` and `store_gradient` are the sink: it steps Adam at once (`shared/sink_adam.wgsl`) or writes the gradient
-// down (`shared/sink_gradient.wgsl`). The pose gradient is that of the left perturbation T ← Exp(τ)·T of camera_from_world, τ = (ρ, θ).
+// down (`shared/sink_gradient.wgsl`).
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<storage, read> counters: array<Counter>;
 // See `tile_lists`.
 @group(0) @binding(2) var<storage, read> intersection_counts: array<u32>;
 @group(0) @binding(3) var<storage, read> intersection_gradients: array<vec4<f32>>;
-// [workgroups, 2] sums over the workgroup of (∂L/∂ρ, 0), (∂L/∂θ, 0).
-@group(0) @binding(4) var<storage, read_write> pose_sums: array<vec4<f32>>;
-
-var<workgroup> rho_sums: array<vec3<f32>, 256>;
-var<workgroup> theta_sums: array<vec3<f32>, 256>;
-
-struct PoseGradient {
-    rho: vec3<f32>,
-    theta: vec3<f32>,
-}
 
 @compute @workgroup_size(256)
 fn main(
@@ -26,29 +16,14 @@ fn main(
     @builtin(num_workgroups) workgroups: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
 ) {
-    let block = linear_workgroup(workgroup, workgroups);
-    let item = block * 256u + local;
-    var pose = PoseGradient(vec3(0.0), vec3(0.0));
+    let item = linear_workgroup(workgroup, workgroups) * 256u + local;
     // Without room for all intersections nothing was rendered: the step will be repeated.
     if item < counters[VISIBLE_COUNTER].count && counters[INTERSECTION_COUNTER].count > 0u {
-        pose = backward(intersection_counts[3u * view.capacity + item]);
-    }
-    rho_sums[local] = pose.rho;
-    theta_sums[local] = pose.theta;
-    for (var stride = 128u; stride > 0u; stride /= 2u) {
-        workgroupBarrier();
-        if local < stride {
-            rho_sums[local] += rho_sums[local + stride];
-            theta_sums[local] += theta_sums[local + stride];
-        }
-    }
-    if local == 0u {
-        pose_sums[block * 2u] = vec4(rho_sums[0], 0.0);
-        pose_sums[block * 2u + 1u] = vec4(theta_sums[0], 0.0);
+        backward(intersection_counts[3u * view.capacity + item]);
     }
 }
 
-fn backward(i: u32) -> PoseGradient {
+fn backward(i: u32) {
     var color_depth = vec4(0.0);
     var first = vec4(0.0);
     var second = vec4(0.0);
@@ -60,7 +35,7 @@ fn backward(i: u32) -> PoseGradient {
     }
     let untouched = all(color_depth == vec4(0.0)) && all(first == vec4(0.0)) && all(second == vec4(0.0));
     if untouched {
-        return PoseGradient(vec3(0.0), vec3(0.0));
+        return;
     }
     let mean_opacity = parameters[i];
     let log_scale = parameters[view.capacity + i].xyz;
@@ -106,11 +81,6 @@ fn backward(i: u32) -> PoseGradient {
     );
     let by_unit = quaternion_gradient(unit_rotation, by_rotation_matrix);
     store_gradient(2u, i, (by_unit - unit_rotation * dot(unit_rotation, by_unit)) * inverse_norm);
-
-    var pose: PoseGradient;
-    pose.rho = by_point + rotate_to_camera(view, by_mean_of_color);
-    pose.theta = cross(projection.p_in_camera, by_point) + cross(axes[0], by_axis_0) + cross(axes[1], by_axis_1) + cross(axes[2], by_axis_2);
-    return pose;
 }
 
 // Product of a symmetric matrix held as (xx, xy, yy).

@@ -137,7 +137,7 @@ pub enum ConfigError {
 }
 
 /// Dotted keys of earlier versions, and those that replaced them; keys of a section before the section itself.
-const RENAMED: [(&str, &str); 27] = [
+const RENAMED: [(&str, &str); 25] = [
     ("mapping.limits.max_keyframes", "mapping.limits.max_gpu_images"),
     ("mapping.density.vcd.min_worth", "mapping.density.multi_view.min_contribution"),
     ("mapping.density.vcd.wrong_pixels", "mapping.density.multi_view.error_pixels"),
@@ -153,8 +153,6 @@ const RENAMED: [(&str, &str); 27] = [
     ("mapping.adam.averaged_steps", "mapping.adam.ema_steps"),
     ("mapping.refine.final_position_rate", "mapping.refine.final_lr_scale_position"),
     ("mapping.refine.final_rate", "mapping.refine.final_lr_scale"),
-    ("mapping.refine_poses.rotation_rate", "mapping.refine_poses.lr_rotation"),
-    ("mapping.refine_poses.translation_rate", "mapping.refine_poses.lr_translation"),
     ("mapping.plane_sweep.trust", "mapping.plane_sweep.depth_confidence"),
     ("mapping.skip.tile_share", "mapping.tile_sampling.share"),
     ("mapping.skip.tile_least", "mapping.tile_sampling.min_share"),

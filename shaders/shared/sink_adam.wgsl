@@ -24,13 +24,13 @@ struct AdamSetup {
 // The share after n steps is 1/(1 + n/this), but the least at least.
 const AVERAGED_PART: f32 = 4.0;
 
-@group(0) @binding(5) var<storage, read_write> parameters: array<vec4<f32>>;
-@group(0) @binding(6) var<storage, read_write> moments_1: array<vec4<f32>>;
-@group(0) @binding(7) var<storage, read_write> moments_2: array<vec4<f32>>;
-@group(0) @binding(8) var<uniform> adam: AdamSetup;
+@group(0) @binding(4) var<storage, read_write> parameters: array<vec4<f32>>;
+@group(0) @binding(5) var<storage, read_write> moments_1: array<vec4<f32>>;
+@group(0) @binding(6) var<storage, read_write> moments_2: array<vec4<f32>>;
+@group(0) @binding(7) var<uniform> adam: AdamSetup;
 // The parameters over each Gaussian's last steps, on average: where successive views pull to and fro, it stays in between. Lane w of plane
 // 1 counts the steps.
-@group(0) @binding(9) var<storage, read_write> averages: array<vec4<f32>>;
+@group(0) @binding(8) var<storage, read_write> averages: array<vec4<f32>>;
 
 // Bias corrections 1/(1 - βⁿ) of the first and the second moments after this step: of all planes, and of the higher harmonics.
 var<private> corrections: vec2<f32>;

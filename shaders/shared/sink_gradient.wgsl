@@ -1,6 +1,6 @@
 // Sink of `project_backward` that writes the gradient down, for tests and for whoever steps elsewhere. Cleared beforehand.
-@group(0) @binding(5) var<storage, read> parameters: array<vec4<f32>>;
-@group(0) @binding(6) var<storage, read_write> gradients: array<vec4<f32>>;
+@group(0) @binding(4) var<storage, read> parameters: array<vec4<f32>>;
+@group(0) @binding(5) var<storage, read_write> gradients: array<vec4<f32>>;
 
 fn begin_gradient(i: u32) {}
 

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{DensityConfig, ExposureConfig, LimitsConfig, PlaneSweepConfig, RefinePosesConfig};
+use super::{DensityConfig, ExposureConfig, LimitsConfig, PlaneSweepConfig};
 use crate::optimise::{AdamConfig, LossConfig, TileSampling};
 use crate::splat::ShDegree;
 
@@ -29,8 +29,6 @@ pub struct MappingConfig {
     pub tile_sampling: TileSamplingConfig,
     /// Bounds on Gaussians, memory and keyframes.
     pub limits: LimitsConfig,
-    /// Refinement of keyframe poses by the images.
-    pub refine_poses: RefinePosesConfig,
     /// Correction of exposure and white balance.
     pub exposure: ExposureConfig,
     /// Insertion of Gaussians at a keyframe.
@@ -61,7 +59,6 @@ impl Default for MappingConfig {
             schedule: ScheduleConfig::default(),
             tile_sampling: TileSamplingConfig::default(),
             limits: LimitsConfig::default(),
-            refine_poses: RefinePosesConfig::default(),
             exposure: ExposureConfig::default(),
             insertion: InsertionConfig::default(),
             plane_sweep: PlaneSweepConfig::default(),
@@ -387,7 +384,6 @@ impl MappingConfig {
         self.tile_sampling.validate().map_err(|e| format!("mapping.tile_sampling: {e}"))?;
         self.exposure.validate().map_err(|e| format!("mapping.exposure: {e}"))?;
         self.plane_sweep.validate().map_err(|e| format!("mapping.plane_sweep: {e}"))?;
-        self.refine_poses.validate().map_err(|e| format!("mapping.refine_poses: {e}"))?;
         self.density.validate().map_err(|e| format!("mapping.density: {e}"))?;
         self.loss.validate().map_err(|e| format!("mapping.loss: {e}"))?;
         self.adam.validate().map_err(|e| format!("mapping.adam: {e}"))

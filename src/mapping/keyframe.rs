@@ -10,7 +10,6 @@ use serde::{Deserialize, Serialize};
 use super::gaussian_stats;
 use super::image_store::ImageStore;
 use super::plane_sweep::{self, SourceView};
-use super::refine_poses::{PoseRefinement, RefinePosesConfig};
 use super::{KeyframeId, MappingError, PoseUpdate};
 use crate::geometry::{Pinhole, Se3, Sim3};
 use crate::gpu::{Gpu, GpuError, plain};
@@ -76,15 +75,12 @@ pub struct RightImage {
 pub(super) struct MappedKeyframe {
     /// Identity, ascending in the order of tracking.
     pub id: KeyframeId,
-    /// At the refined pose.
+    /// At the tracker's pose.
     pub camera: ViewCamera,
-    /// The tracker's camera_from_world, which the refinement goes out from.
-    pub tracked_from_world: Se3,
     /// camera_from_world at which its Gaussians were inserted, or to which they were last moved.
     anchored_from_world: Se3,
     /// Factor by which lengths around it have grown since then.
     scale_since_anchor: f64,
-    pub refinement: PoseRefinement,
     /// Exposure of the recorded image against the map.
     pub exposure: Exposure,
     /// Median of the measured depths, metres; 1 if there are none.
@@ -103,10 +99,8 @@ pub(super) struct KeyframeState {
     /// Identity, ascending in the order of tracking.
     pub id: KeyframeId,
     camera: ViewCamera,
-    tracked_from_world: Se3,
     anchored_from_world: Se3,
     scale_since_anchor: f64,
-    refinement: PoseRefinement,
     exposure: Exposure,
     depth_metres: f64,
     covisible: Vec<KeyframeId>,
@@ -130,10 +124,8 @@ impl MappedKeyframe {
         Ok(Self {
             id: keyframe.id,
             camera,
-            tracked_from_world: camera.camera_from_world,
             anchored_from_world: camera.camera_from_world,
             scale_since_anchor: 1.0,
-            refinement: PoseRefinement::default(),
             exposure,
             depth_metres: image.median_depth_metres().unwrap_or(1.0),
             image: Images::new(gpu, image, with_half)?,
@@ -148,10 +140,8 @@ impl MappedKeyframe {
         Ok(KeyframeState {
             id: self.id,
             camera: self.camera,
-            tracked_from_world: self.tracked_from_world,
             anchored_from_world: self.anchored_from_world,
             scale_since_anchor: self.scale_since_anchor,
-            refinement: self.refinement,
             exposure: self.exposure,
             depth_metres: self.depth_metres,
             covisible: self.covisible.clone(),
@@ -186,10 +176,8 @@ impl MappedKeyframe {
         let mut restored = Self {
             id: state.id,
             camera: state.camera,
-            tracked_from_world: state.tracked_from_world,
             anchored_from_world: state.anchored_from_world,
             scale_since_anchor: state.scale_since_anchor,
-            refinement: state.refinement,
             exposure: state.exposure,
             depth_metres: state.depth_metres,
             gray: state.swept.as_ref().map(|_| plane_sweep::gray(&image.color)),
@@ -207,8 +195,7 @@ impl MappedKeyframe {
     /// refinement. Its estimated depth is scaled along; measured depth stays.
     pub fn update_pose(&mut self, gpu: &Gpu, store: &mut ImageStore, update: &PoseUpdate) -> Result<Option<Sim3>, MappingError> {
         let camera_from_world = update.world_from_camera.inverse();
-        self.refinement.refined_from_tracked.translation.vector *= update.scale;
-        self.track(camera_from_world);
+        self.camera.camera_from_world = camera_from_world;
         self.scale_since_anchor *= update.scale;
         let scale = self.scale_since_anchor;
         let motion = gaussian_stats::motion(&self.anchored_from_world.inverse(), &update.world_from_camera, scale);
@@ -220,18 +207,6 @@ impl MappedKeyframe {
             }
         }
         Ok(motion)
-    }
-
-    /// At the tracker's pose; its refinement goes along.
-    fn track(&mut self, tracked_from_world: Se3) {
-        self.tracked_from_world = tracked_from_world;
-        self.camera.camera_from_world = self.refinement.refined_from_tracked * tracked_from_world;
-    }
-
-    /// Follows the images by one step, see [`PoseRefinement::step`].
-    pub fn refine(&mut self, gradient: &[f32; 6], lr_scale: f32, config: &RefinePosesConfig) {
-        self.refinement.step(gradient, lr_scale, config);
-        self.track(self.tracked_from_world);
     }
 
     /// Whether its image is on the GPU.

@@ -3,7 +3,6 @@
 mod control;
 mod exposures;
 mod refine;
-mod relative_poses;
 mod state;
 mod within_limits;
 
@@ -22,7 +21,6 @@ use super::gaussian_stats::GaussianStats;
 use super::image_store::ImageStore;
 use super::keyframe::{DepthSource, MappedKeyframe};
 use super::plane_sweep::{self, SourceView};
-use super::refine_poses::RefinedPair;
 use super::schedule::{self, Session, Step};
 use super::{Keyframe, KeyframeId, MappingConfig, MappingError, PoseUpdate, exposure, initialise_from_points};
 use crate::geometry::Se3;
@@ -172,18 +170,6 @@ impl Mapper {
         Ok(moved.iter().map(|motion| motion.run.len()).sum())
     }
 
-    /// Refined relative poses of the window, for the tracker; empty unless poses are refined.
-    pub fn refined(&self) -> Vec<RefinedPair> {
-        if !self.config.refine_poses.enabled || self.keyframes.is_empty() {
-            return Vec::new();
-        }
-        relative_poses::refined(
-            &self.keyframes,
-            &schedule::window(&self.keyframes, &self.config.window),
-            &self.config.refine_poses,
-        )
-    }
-
     /// Downloads the averaged parameters of all Gaussians. Blocks until the GPU is idle.
     ///
     /// # Errors
@@ -280,7 +266,6 @@ impl Mapper {
             let batch = session.next(count, &self.keyframes, &mut self.rng, &self.config.window, &self.config.schedule);
             let adam = &self.config.clone().adam;
             let reports = self.steps(&batch, None, self.tile_sampling(), adam)?;
-            self.refine_poses(session.window(), &batch, &reports);
             psnr_sum += reports.iter().map(|r| r.loss.psnr_db()).sum::<f32>();
             done += batch.len();
             let losses: Vec<f32> = reports.iter().map(|r| r.loss.total(&self.config.loss)).collect();
@@ -294,18 +279,9 @@ impl Mapper {
         if self.config.yields_to_keyframes { YIELDING_BATCH } else { BATCH }
     }
 
-    /// Moves the window's keyframes down the gradients of the steps; the first keyframe is the world and stays.
-    fn refine_poses(&mut self, window: &[usize], batch: &[Step], reports: &[StepReport]) {
-        let config = &self.config.refine_poses;
-        let moves = |step: &Step| config.enabled && step.keyframe > 0 && window.contains(&step.keyframe);
-        for (step, report) in batch.iter().zip(reports).filter(|(step, _)| moves(step)) {
-            self.keyframes[step.keyframe].refine(&report.pose, step.lr_scale, config);
-        }
-    }
-
-    /// Tile sampling of online steps; `None` for all tiles. A pose is refined by its whole image.
+    /// Tile sampling of online steps; `None` for all tiles.
     fn tile_sampling(&self) -> Option<TileSampling> {
-        self.config.tile_sampling.sampling().filter(|_| !self.config.refine_poses.enabled)
+        self.config.tile_sampling.sampling()
     }
 
     fn steps(

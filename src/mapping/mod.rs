@@ -15,7 +15,6 @@ mod limits;
 mod mapper;
 mod message;
 mod plane_sweep;
-mod refine_poses;
 mod schedule;
 
 pub use config::{InsertionConfig, MappingConfig, PointsConfig, RefineConfig, ScheduleConfig, TileSamplingConfig, WindowConfig};
@@ -27,7 +26,6 @@ pub use limits::LimitsConfig;
 pub use mapper::{FinalRefinement, KeyframeReport, Mapper, MapperState, RefineReport};
 pub use message::{MapperMessage, PoseUpdate};
 pub use plane_sweep::PlaneSweepConfig;
-pub use refine_poses::{RefinePosesConfig, RefinedPair};
 
 /// Index of a keyframe in the order of tracking; unique and ascending.
 pub type KeyframeId = usize;

@@ -60,10 +60,6 @@ impl Session {
         Self { window, steps, taken: 0, converged: false, losses: BTreeMap::new(), gain: Gain::default() }
     }
 
-    pub fn window(&self) -> &[usize] {
-        &self.window
-    }
-
     pub fn taken(&self) -> usize {
         self.taken
     }

@@ -11,7 +11,6 @@ pub(super) struct Kernels {
     pub rasterize_backward: Kernel,
     pub project_backward: Kernel,
     pub project_backward_adam: Kernel,
-    pub pose_reduce: Kernel,
 }
 
 impl Kernels {
@@ -29,7 +28,6 @@ impl Kernels {
             }),
             project_backward: kernel(&shaders::PROJECT_BACKWARD),
             project_backward_adam: kernel(&shaders::PROJECT_BACKWARD_ADAM),
-            pose_reduce: kernel(&shaders::POSE_REDUCE),
         }
     }
 }

@@ -15,8 +15,9 @@ use super::kernels::Kernels;
 use super::scores::{ErrorPixels, GaussianScore, ScoredImage, Scores};
 use super::tile_sampling::{TileSampler, TileSampling};
 use super::{AdamConfig, LossConfig, LossTerms, Pixels, TargetImage};
+use crate::geometry::Pinhole;
 use crate::gpu::{Gpu, GpuBuffer, GpuError};
-use crate::render::layout::{AdamSetup, COUNTERS, Counter, LossSetup, View};
+use crate::render::layout::{AdamSetup, COUNTERS, Counter, LossSetup};
 use crate::render::{BlendForm, GpuCloud, Rasterizer, Rendered, ViewCounts, cloud_from_planes};
 use crate::splat::{Exposure, GaussianCloud, ViewCamera};
 
@@ -27,8 +28,6 @@ pub struct StepReport {
     pub loss: LossTerms,
     /// Work of the view.
     pub counts: ViewCounts,
-    /// Gradient of the loss by the pose before the step, as in [`Gradients`].
-    pub pose: [f32; 6],
 }
 
 /// A view to learn from.
@@ -60,24 +59,21 @@ impl<'a> TrainingView<'a> {
     }
 }
 
-/// What a step leaves behind on the GPU: sums of the loss, the gradient by the pose, and the counters.
+/// What a step leaves behind on the GPU: sums of the loss, and the counters.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 struct StepLog {
     loss: [f32; 4],
-    pose: [[f32; 4]; 2],
     counters: [Counter; COUNTERS as usize],
 }
 
-/// Gradient of a loss by the map and by the pose.
+/// Gradient of a loss by the map.
 #[derive(Clone, Debug)]
 pub struct Gradients {
     /// Terms of the image loss.
     pub loss: LossTerms,
     /// By the raw parameters of each Gaussian, in the shape of the map.
     pub cloud: GaussianCloud,
-    /// By τ = (ρ, θ) of `camera_from_world ← Exp(τ)·camera_from_world`.
-    pub pose: [f32; 6],
 }
 
 /// Gradient of a loss by a rendered image.
@@ -117,10 +113,7 @@ pub struct Trainer {
     loss_setup: GpuBuffer,
     /// Of each size of view, the present one first.
     images: Vec<ImageBuffers>,
-    gaussians: usize,
     loss_total: GpuBuffer,
-    pose_sums: GpuBuffer,
-    pose_gradient: GpuBuffer,
 }
 
 impl Trainer {
@@ -145,7 +138,6 @@ impl Trainer {
         let gpu = rasterizer.gpu();
         let kernels = Kernels::new(&rasterizer);
         gpu.check()?;
-        let empty = |label: &str| GpuBuffer::storage(gpu, label, 16);
         Ok(Self {
             kernels,
             scores: Scores::new(&rasterizer)?,
@@ -155,10 +147,7 @@ impl Trainer {
             adam: GpuBuffer::uniform(gpu, "Adam", &AdamSetup::zeroed())?,
             loss_setup: GpuBuffer::uniform(gpu, "loss setup", &LossSetup::zeroed())?,
             images: Vec::new(),
-            gaussians: 0,
             loss_total: GpuBuffer::computed_uniform(gpu, "loss", 16)?,
-            pose_sums: empty("pose sums")?,
-            pose_gradient: GpuBuffer::storage(gpu, "pose gradient", 32)?,
             rasterizer,
         })
     }
@@ -201,7 +190,7 @@ impl Trainer {
                     Some(counts) => {
                         let pixels = views[i].target.width * views[i].target.height;
                         let loss = LossTerms::from_sums(entry.loss, pixels);
-                        reports[i] = StepReport { loss, counts, pose: tangent(entry.pose) };
+                        reports[i] = StepReport { loss, counts };
                     }
                     None => repeat.push(i),
                 }
@@ -270,7 +259,7 @@ impl Trainer {
         Ok(gradients)
     }
 
-    /// Gradients of any loss by the map and the pose, from its gradients by the image; moves nothing.
+    /// Gradients of any loss by the map, from its gradients by the image; moves nothing.
     ///
     /// # Errors
     /// [`GpuError`] if a buffer does not fit or the device fails.
@@ -282,7 +271,8 @@ impl Trainer {
         by_image: &ImageGradients,
     ) -> Result<Gradients, GpuError> {
         let gpu = self.rasterizer.gpu().clone();
-        self.reserve(&gpu, &View::new(camera, background), cloud)?;
+        let Pinhole { width, height, .. } = camera.pinhole;
+        image_buffers::choose(&mut self.images, &gpu, (width, height))?;
         self.images[0].gradients.write(&gpu, 0, &by_image.color_depth);
         let alpha: Vec<[f32; 4]> = by_image.alpha.iter().map(|a| [*a, 0.0, 0.0, 0.0]).collect();
         self.images[0].gradients.write(&gpu, by_image.color_depth.len(), &alpha);
@@ -302,9 +292,8 @@ impl Trainer {
         let planes = (0..cloud.planes())
             .map(|plane| sink.read(&gpu, plane * cloud.capacity(), cloud.len()))
             .collect::<Result<Vec<_>, _>>()?;
-        let pose = self.pose_gradient.read(&gpu, 0, 2)?;
         let cloud = cloud_from_planes(cloud.sh_degree(), &planes);
-        Ok(Gradients { loss: LossTerms::default(), cloud, pose: tangent([pose[0], pose[1]]) })
+        Ok(Gradients { loss: LossTerms::default(), cloud })
     }
 
     /// Submits one step and waits, again with larger buffers if its intersections did not fit.
@@ -337,7 +326,7 @@ impl Trainer {
     ) -> Result<(), GpuError> {
         let gpu = self.rasterizer.gpu().clone();
         let prepared = self.rasterizer.prepare(cloud, viewpoint.camera, viewpoint.background)?;
-        self.reserve(&gpu, &prepared.view, cloud)?;
+        image_buffers::choose(&mut self.images, &gpu, (prepared.view.width, prepared.view.height))?;
         self.rasterizer.encode_clear(encoder);
         if let Objective::Image { view: TrainingView { target, streamed, .. }, .. } = objective {
             match (&target.pixels, streamed) {
@@ -375,11 +364,6 @@ impl Trainer {
         let total: Vec<[f32; 4]> = self.loss_total.read(gpu, 0, 1)?;
         Ok(LossTerms::from_sums(total[0], target.width * target.height))
     }
-
-    fn reserve(&mut self, gpu: &Gpu, view: &View, cloud: &GpuCloud) -> Result<(), GpuError> {
-        image_buffers::choose(&mut self.images, gpu, (view.width, view.height))?;
-        self.reserve_gaussians(gpu, cloud.capacity())
-    }
 }
 
 /// A camera and the colour behind the map, linear RGB.
@@ -390,9 +374,4 @@ struct Viewpoint<'a> {
 
 fn copy(encoder: &mut wgpu::CommandEncoder, from: &GpuBuffer, to: &GpuBuffer) {
     encoder.copy_buffer_to_buffer(from.raw(), 0, to.raw(), 0, from.raw().size());
-}
-
-/// (ρ, θ) of a vector as the GPU keeps it: (ρ, 0), (θ, 0).
-fn tangent([[a, b, c, _], [d, e, f, _]]: [[f32; 4]; 2]) -> [f32; 6] {
-    [a, b, c, d, e, f]
 }

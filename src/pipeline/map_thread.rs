@@ -7,14 +7,11 @@ use std::time::{Duration, Instant};
 
 use crossbeam::channel::Receiver;
 
-use super::pose_feedback::PoseFeedbackSender;
 use super::progress::guarded;
 use super::{PipelineError, Progress};
 use crate::evaluation::machine;
 use crate::gpu::Gpu;
-use crate::mapping::{
-    FinalRefinement, KeyframeId, KeyframeReport, Mapper, MapperMessage, MappingConfig, MappingError, RefinedPair,
-};
+use crate::mapping::{FinalRefinement, KeyframeId, KeyframeReport, Mapper, MapperMessage, MappingConfig, MappingError};
 use crate::run_folder::{CheckpointError, Checkpointer, KeyframeRecord, RunState};
 use crate::sequence::Frame;
 use crate::splat::{Exposure, GaussianCloud, MapSnapshot};
@@ -52,7 +49,6 @@ pub(super) struct MapThread<'a> {
     pub messages: &'a Receiver<MapperMessage>,
     /// Real time: frames that wait for the tracker.
     pub frames: Option<&'a Receiver<Frame>>,
-    pub feedback: &'a PoseFeedbackSender,
     pub progress: &'a Progress,
 }
 
@@ -101,7 +97,7 @@ impl MapThread<'_> {
         Ok(Start { mapper, cloud: Arc::default(), refinement: None, records: Vec::new() })
     }
 
-    /// Replays the messages up to a checkpoint: uploads keyframe images, and sends the tracker the stored pose feedback.
+    /// Replays the messages up to a checkpoint: uploads keyframe images.
     ///
     /// # Errors
     /// If the messages end before the checkpoint, or differ from those before the interruption.
@@ -115,22 +111,17 @@ impl MapThread<'_> {
         };
         let mut mapper = Mapper::restore(self.gpu.clone(), self.config, &state.mapper).map_err(explained)?;
         let records = state.records();
-        let keyframes = state.feedback.len();
-        let mut feedback = state.feedback.into_iter();
         while checkpointer.digest().messages < state.digest.messages {
             let Ok(message) = self.messages.recv() else { return Err(PipelineError::NotCaughtUp { checkpoint: path }) };
             checkpointer.received(&message);
             if let MapperMessage::Keyframe(keyframe) = message {
                 mapper.insert_again(&keyframe, &state.mapper).map_err(explained)?;
-                let refined = feedback.next().ok_or_else(not_repeated)?;
-                self.feedback.send(keyframe.id, &refined);
-                checkpointer.sent_feedback(refined);
             }
         }
-        if checkpointer.digest() != state.digest || feedback.len() > 0 {
+        if checkpointer.digest() != state.digest {
             return Err(not_repeated());
         }
-        tracing::info!(keyframes, gaussians = mapper.gaussians(), "checkpoint reached");
+        tracing::info!(keyframes = records.len(), gaussians = mapper.gaussians(), "checkpoint reached");
         let cloud = Arc::new(mapper.download()?);
         Ok(Start { mapper, cloud, refinement: state.mapper.into_refinement(), records })
     }
@@ -151,7 +142,7 @@ impl MapThread<'_> {
                 self.progress.stopped() || (self.config.yields_to_keyframes && inbox.keyframe_waits())
             };
             checkpoints.checkpointer.iter_mut().for_each(|c| c.received(&message));
-            let Processed { report, refined, cloud } = guarded("mapping", || self.process(mapper, message, &stop))?;
+            let Processed { report, cloud } = guarded("mapping", || self.process(mapper, message, &stop))?;
             tracing::debug!(?report, "message processed");
             let record = |report| KeyframeRecord {
                 report,
@@ -165,7 +156,6 @@ impl MapThread<'_> {
             summary.publish(cloud, psnr_db, self.progress);
             // A keyframe that was cut short differs from that of an unbroken run.
             if report.is_some() && !self.progress.stopped() {
-                checkpoints.checkpointer.iter_mut().for_each(|c| c.sent_feedback(refined.clone()));
                 checkpoints.finished_one(mapper, None, &summary.keyframes);
             }
         }
@@ -173,22 +163,19 @@ impl MapThread<'_> {
     }
 
     fn process(&self, mapper: &mut Mapper, message: MapperMessage, stop: &dyn Fn() -> bool) -> Result<Processed, PipelineError> {
-        let (report, refined, changed) = match message {
+        let (report, changed) = match message {
             MapperMessage::Points(points) => {
                 mapper.add_points(&points, 0)?;
-                (None, Vec::new(), true)
+                (None, true)
             }
-            MapperMessage::PoseUpdate(updates) => (None, Vec::new(), mapper.update_poses(&updates)? > 0),
+            MapperMessage::PoseUpdate(updates) => (None, mapper.update_poses(&updates)? > 0),
             MapperMessage::Keyframe(keyframe) => {
                 let report = mapper.insert(&keyframe, stop)?;
-                let refined = mapper.refined();
-                tracing::trace!(keyframe = keyframe.id, ?refined, "poses refined");
-                self.feedback.send(keyframe.id, &refined);
-                (Some(report), refined, report.inserted + report.iterations > 0)
+                (Some(report), report.inserted + report.iterations > 0)
             }
         };
         let cloud = if changed { Some(Arc::new(mapper.download()?)) } else { None };
-        Ok(Processed { report, refined, cloud })
+        Ok(Processed { report, cloud })
     }
 
     /// The final refinement, one round at a time, each published; continues the one that a resumed run had begun.
@@ -280,8 +267,6 @@ fn wait_for_tracker(frames: &Receiver<Frame>) {
 /// Effects of one message.
 struct Processed {
     report: Option<KeyframeReport>,
-    /// Pose feedback of the keyframe.
-    refined: Vec<RefinedPair>,
     /// The map, if it changed.
     cloud: Option<Arc<GaussianCloud>>,
 }

@@ -11,7 +11,6 @@
 
 mod known_poses;
 mod map_thread;
-mod pose_feedback;
 mod progress;
 mod read_thread;
 mod run;

@@ -8,7 +8,6 @@ use crossbeam::channel::bounded;
 
 use super::known_poses::{self, Scene};
 use super::map_thread::{MapSummary, MapThread};
-use super::pose_feedback;
 use super::progress::guarded;
 use super::read_thread::{self, ReadSummary};
 use super::track_thread::{TrackSummary, TrackThread};
@@ -51,7 +50,6 @@ pub fn run(
     let (frame_sender, frames) = bounded(FRAMES_AHEAD);
     let waiting = real_time.then(|| frames.clone());
     let (message_sender, messages) = bounded(MESSAGES_AHEAD);
-    let (feedback_sender, feedback) = pose_feedback::channel(config);
     let scene = &config.replay.known_poses.then(|| Scene::new(recording, progress)).transpose()?;
     let mapping = &scene.as_ref().map_or_else(|| config.mapping.clone(), |scene| scene.in_units(&config.mapping));
     let (read, track, map) = std::thread::scope(|scope| {
@@ -61,15 +59,14 @@ pub fn run(
             .name("mapping".into())
             .spawn_scoped(scope, move || {
                 let (messages, frames) = (&messages, waiting.as_ref());
-                MapThread { gpu, config: mapping, messages, frames, feedback: &feedback_sender, progress }
-                    .map(&mut |_| (), checkpointer)
+                MapThread { gpu, config: mapping, messages, frames, progress }.map(&mut |_| (), checkpointer)
             })
             .map_err(spawn_error("mapping"))?;
         let track = Builder::new()
             .name("tracking".into())
             .spawn_scoped(scope, move || {
                 let thread = TrackThread { recording, frames: &frames, mapper: &message_sender, progress };
-                scene.as_ref().map_or_else(|| thread.track(feedback), |scene| known_poses::follow(&thread, scene))
+                scene.as_ref().map_or_else(|| thread.track(), |scene| known_poses::follow(&thread, scene))
             })
             .map_err(spawn_error("tracking"))?;
         let read = Builder::new()

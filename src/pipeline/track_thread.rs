@@ -4,7 +4,6 @@ use std::collections::BTreeMap;
 
 use crossbeam::channel::{Receiver, Sender, TrySendError};
 
-use super::pose_feedback::PoseFeedbackReceiver;
 use super::progress::{TrackingProgress, guarded};
 use super::{PipelineError, Progress};
 use crate::geometry::{StampedPose, Trajectory};
@@ -113,7 +112,7 @@ pub(super) struct TrackThread<'a> {
 
 impl TrackThread<'_> {
     /// Tracks until the frames end, an error occurs, or the mapper closes the channel.
-    pub fn track(&self, mut feedback: PoseFeedbackReceiver) -> TrackSummary {
+    pub fn track(&self) -> TrackSummary {
         let (sequence, config) = (self.recording.sequence(), self.recording.config());
         let mut summary = TrackSummary::default();
         let mut tracker = match Tracker::new(sequence.camera, sequence.sensor, &config.tracking) {
@@ -135,12 +134,7 @@ impl TrackThread<'_> {
             summary.frames.push(FrameRecord { frame: frame.index, lost, times: tracked.times });
             let progress = TrackingProgress { frames_done: frame.index + 1, keyframes: tracker.keyframes().len(), lost };
             self.progress.tracking.force_push(progress);
-            let keyframe = tracked.keyframe.as_ref().map(|k| k.id);
             if !keyframes.retry() || !self.send(&mut keyframes, &rectifier, &frame, tracked) {
-                break;
-            }
-            if let Err(error) = tracker.measure(&feedback.receive(keyframe)) {
-                summary.error = Some(error.into());
                 break;
             }
         }

@@ -8,7 +8,6 @@ use crossbeam::channel::{bounded, unbounded};
 
 use super::known_poses::{self, Scene};
 use super::map_thread::{MapSummary, MapThread, Round};
-use super::pose_feedback::{PoseFeedbackReceiver, PoseFeedbackSender};
 use super::run::FRAMES_AHEAD;
 use super::track_thread::TrackThread;
 use super::{PipelineError, Progress, read_thread};
@@ -62,8 +61,7 @@ impl<'a> TrackedLog<'a> {
                 .spawn_scoped(scope, move || read_thread::read(recording.sequence(), false, &frame_sender, progress))
                 .map_err(|source| PipelineError::Spawn { thread: "reading", source })?;
             let thread = TrackThread { recording, frames: &frames, mapper: &message_sender, progress };
-            let track = || thread.track(PoseFeedbackReceiver::default());
-            Ok::<_, PipelineError>(scene.as_ref().map_or_else(track, |scene| known_poses::follow(&thread, scene)))
+            Ok::<_, PipelineError>(scene.as_ref().map_or_else(|| thread.track(), |scene| known_poses::follow(&thread, scene)))
         })?;
         drop(message_sender);
         if let Some(error) = track.error {
@@ -101,8 +99,7 @@ impl<'a> TrackedLog<'a> {
             paused += reached.elapsed();
         };
         let config = &self.scene.as_ref().map_or_else(|| config.clone(), |scene| scene.in_units(config));
-        let (messages, feedback) = (&messages, &PoseFeedbackSender::default());
-        let summary = MapThread { gpu, config, messages, frames: None, feedback, progress }.map(&mut on_round, None);
+        let summary = MapThread { gpu, config, messages: &messages, frames: None, progress }.map(&mut on_round, None);
         let MapSummary { cloud, keyframes, step_ms, error, .. } = summary;
         let exposures = exposures(&self.keyframes, &keyframes);
         let mapped = MappedLog { cloud, exposures, wall_s: (started.elapsed() - paused).as_secs_f64(), steps: step_ms.len() };

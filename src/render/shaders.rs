@@ -63,7 +63,6 @@ shaders! {
     GATHER_SCORES = "gather_scores", "gather_scores", [VIEW, COUNTERS], ["main"];
     PROJECT_BACKWARD = "project_backward", "project_backward", [VIEW, COUNTERS, PROJECTION, HARMONICS, SINK_GRADIENT], ["main"];
     PROJECT_BACKWARD_ADAM = "project_backward_adam", "project_backward", [VIEW, COUNTERS, PROJECTION, HARMONICS, SINK_ADAM], ["main"];
-    POSE_REDUCE = "pose_reduce", "pose_reduce", [COUNTERS], ["main"];
     RATES = "rates", "rates", [VIEW], ["copy_memory", "multiply_add"];
     GATHER = "gather", "gather", [VIEW], ["main"];
 }

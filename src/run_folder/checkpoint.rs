@@ -17,7 +17,7 @@ use super::outputs;
 use crate::config::Config;
 use crate::files::{WriteError, write_durably};
 use crate::gpu::Gpu;
-use crate::mapping::{KeyframeReport, MapperState, MappingError, RefinedPair};
+use crate::mapping::{KeyframeReport, MapperState, MappingError};
 use crate::recording::Recording;
 
 /// The first line; only the version that wrote a file knows how to read the rest.
@@ -82,8 +82,6 @@ pub(crate) struct RunState {
     /// State of the mapper.
     pub mapper: MapperState,
     records: Vec<(KeyframeReport, [f64; 2], usize, Option<u64>)>,
-    /// Pose feedback that was sent to the tracker after each keyframe.
-    pub feedback: Vec<Vec<RefinedPair>>,
     /// Time and interruptions so far.
     pub elapsed: Elapsed,
 }
@@ -140,15 +138,9 @@ impl Checkpoint {
 
 impl RunState {
     /// Packs keyframe records beside the rest.
-    pub fn new(
-        digest: MessageDigest,
-        mapper: MapperState,
-        records: &[KeyframeRecord],
-        feedback: &[Vec<RefinedPair>],
-        elapsed: Elapsed,
-    ) -> Self {
+    pub fn new(digest: MessageDigest, mapper: MapperState, records: &[KeyframeRecord], elapsed: Elapsed) -> Self {
         let records = records.iter().map(|r| (r.report, [r.done_s, r.busy_s], r.waiting, r.host_bytes)).collect();
-        Self { digest, mapper, records, feedback: feedback.to_vec(), elapsed }
+        Self { digest, mapper, records, elapsed }
     }
 
     /// Records of the keyframes so far.
@@ -298,10 +290,10 @@ mod tests {
         };
         let records = [record(4), record(6)];
         let elapsed = Elapsed { wall_s: 40.0, resumed: 2 };
-        let state = RunState::new(MessageDigest::default(), MapperState::default(), &records, &[Vec::new()], elapsed);
+        let state = RunState::new(MessageDigest::default(), MapperState::default(), &records, elapsed);
         Checkpoint::write(&path, &identity(), Some(&state)).unwrap();
         let read = Checkpoint::read(&path).unwrap().state.unwrap();
-        assert_eq!((read.records(), read.feedback, read.elapsed), (records.to_vec(), vec![Vec::new()], elapsed));
+        assert_eq!((read.records(), read.elapsed), (records.to_vec(), elapsed));
     }
 
     #[test]

@@ -8,7 +8,7 @@ use super::history::KeyframeRecord;
 use super::message_digest::MessageDigest;
 use crate::files::WriteError;
 use crate::gpu::Gpu;
-use crate::mapping::{FinalRefinement, Mapper, MapperMessage, RefinedPair};
+use crate::mapping::{FinalRefinement, Mapper, MapperMessage};
 use crate::recording::Recording;
 
 /// Path and interval of a run's checkpoints, and the part of its state that the mapper does not hold.
@@ -23,7 +23,6 @@ pub struct Checkpointer {
     /// State to continue from, until the mapper has taken it.
     resume_from: Option<RunState>,
     digest: MessageDigest,
-    feedback: Vec<Vec<RefinedPair>>,
     /// Before this process.
     earlier: Elapsed,
     started: Instant,
@@ -59,7 +58,6 @@ impl Checkpointer {
             every,
             since: 0,
             digest: MessageDigest::default(),
-            feedback: Vec::new(),
             earlier: resume_from.as_ref().map_or_else(Elapsed::default, |state| state.elapsed),
             resume_from,
             started: Instant::now(),
@@ -96,11 +94,6 @@ impl Checkpointer {
         self.digest.update(message);
     }
 
-    /// Records the pose feedback of a mapped keyframe.
-    pub(crate) fn sent_feedback(&mut self, refined: Vec<RefinedPair>) {
-        self.feedback.push(refined);
-    }
-
     /// Counts a finished keyframe or round, and writes a checkpoint if one is due; returns its size in bytes.
     ///
     /// # Errors
@@ -115,7 +108,7 @@ impl Checkpointer {
             return Ok(None);
         }
         let elapsed = self.elapsed(self.started.elapsed());
-        let state = RunState::new(self.digest, mapper.state(refinement)?, records, &self.feedback, elapsed);
+        let state = RunState::new(self.digest, mapper.state(refinement)?, records, elapsed);
         Ok(Some(Checkpoint::write(&self.path, &self.identity, Some(&state))?))
     }
 
@@ -187,23 +180,9 @@ mod tests {
     }
 
     #[test]
-    fn feedback_is_kept_keyframe_by_keyframe() {
-        let pair = RefinedPair {
-            keyframe: 2,
-            relative_to: 1,
-            keyframe_from_relative: Se3::identity(),
-            sigma_translation_metres: 0.01,
-            sigma_rotation_rad: 0.001,
-        };
-        let mut run = checkpointer(1, None);
-        [Vec::new(), vec![pair]].into_iter().for_each(|refined| run.sent_feedback(refined));
-        assert_eq!(run.feedback, [Vec::new(), vec![pair]]);
-    }
-
-    #[test]
     fn a_resumed_run_continues_from_its_state_once_and_adds_its_time() {
         let earlier = Elapsed { wall_s: 40.0, resumed: 2 };
-        let state = RunState::new(MessageDigest::default(), MapperState::default(), &[], &[], earlier);
+        let state = RunState::new(MessageDigest::default(), MapperState::default(), &[], earlier);
         let mut resumed = checkpointer(3, Some(state));
         assert!(resumed.is_behind());
         assert_eq!(resumed.take_state().unwrap().elapsed, earlier);

@@ -31,16 +31,6 @@ pub enum TrackingError {
         /// Pixels.
         found_height: u32,
     },
-    /// A relative pose of keyframes is invalid.
-    #[error("the pose of keyframe {keyframe} relative to {relative_to} is refused: {problem}")]
-    Measurement {
-        /// The measured keyframe.
-        keyframe: usize,
-        /// The reference keyframe.
-        relative_to: usize,
-        /// What is wrong with it.
-        problem: String,
-    },
     /// The system gave no thread.
     #[error("the thread for bundle adjustment could not be started: {0}")]
     Spawn(#[source] std::io::Error),

@@ -22,7 +22,6 @@ mod tracker;
 
 pub use config::TrackingConfig;
 pub use error::TrackingError;
-pub use solvers::relative_pose::PoseMeasurement;
 pub use tracker::Tracker;
 
 use nalgebra::Vector2;

@@ -46,7 +46,6 @@ fn two_hundred_steps_on_noise_end_finite() {
         for _ in 0..STEPS / BATCH {
             let reports = trainer.steps(&on_gpu, &[view; BATCH], &LossConfig::default(), &adam).unwrap();
             losses.extend(reports.iter().map(|r| r.loss.total(&LossConfig::default())));
-            assert!(reports.iter().all(|r| r.pose.iter().all(|v| v.is_finite())), "scene {seed}: pose gradient");
         }
         assert!(losses.iter().all(|loss| loss.is_finite()), "scene {seed}: {losses:?}");
         assert!(losses[STEPS - 1] < losses[0], "scene {seed}: {} after {}", losses[STEPS - 1], losses[0]);

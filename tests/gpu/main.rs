@@ -12,7 +12,6 @@ mod mapper;
 mod motion;
 mod properties;
 mod reference_gradients;
-mod refined_poses;
 mod scores;
 mod shaders;
 mod stress;

@@ -124,8 +124,8 @@ fn check(seed: u64, faults: &[(u8, f32)]) -> Result<(), TestCaseError> {
     let by = ImageGradients { color_depth, alpha };
     let got = trainer.gradients_from_image(&on_gpu, &view.camera, background, &by).unwrap();
     let flat: Vec<f64> = cloud64(&got.cloud).iter().flat_map(Gaussian64::flat).collect();
-    prop_assert!(flat.iter().all(|v| v.is_finite()) && got.pose.iter().all(|v| v.is_finite()), "a gradient is not finite");
-    let expected: Vec<f64> = backward(&view, &wide, &by_image).cloud.iter().flat_map(Gaussian64::flat).collect();
+    prop_assert!(flat.iter().all(|v| v.is_finite()), "a gradient is not finite");
+    let expected: Vec<f64> = backward(&view, &wide, &by_image).iter().flat_map(Gaussian64::flat).collect();
     let error = crate::common::relative_error(&flat, &expected);
     prop_assert!(error < tolerance, "gradient: {error:e}, {judged:?}");
     Ok(())

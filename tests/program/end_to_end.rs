@@ -175,25 +175,6 @@ fn a_run_repeats_to_the_byte() {
     }
 }
 
-/// The tracker then waits for the mapper, and takes its measurements at fixed frames.
-#[test]
-fn poses_refined_by_the_mapper_repeat_to_the_byte() {
-    if skipped_without_adapter() {
-        return;
-    }
-    let settings =
-        ["mapping.refine_poses.enabled=true", "mapping.iterations_per_keyframe=40", "tracking.keyframe_translation=0.02"];
-    let told: Vec<&str> = settings.iter().flat_map(|s| ["--set", s]).collect();
-    let untold = [told.as_slice(), &["--set", "mapping.refine_poses.tell_tracker=false"]].concat();
-    let out = run("refined", recording(), &told);
-    assert_same_run(&run("refined-again", recording(), &told), &out);
-    // It makes a difference, to the map and through the tracker.
-    let alone = run("refined-untold", recording(), &untold);
-    assert!(read(alone.join("map.ply")) != read(out.join("map.ply")));
-    assert!(read(alone.join("keyframes.txt")) != read(out.join("keyframes.txt")));
-    assert_plausible(metrics(&out).images.held_out, FRAMES / 8);
-}
-
 #[test]
 fn the_written_configuration_runs_again() {
     if skipped_without_adapter() {

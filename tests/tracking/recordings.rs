@@ -3,7 +3,7 @@
 use image::{Rgb, RgbImage};
 use keysplat::geometry::{Camera, Distortion, Pinhole, Se3, StampedPose, se3};
 use keysplat::sequence::{DepthImage, Frame, Sensor, Sequence};
-use keysplat::tracking::{KeyframeUpdate, PoseMeasurement, TrackedFrame, Tracker, TrackingConfig, TrackingState};
+use keysplat::tracking::{KeyframeUpdate, TrackedFrame, Tracker, TrackingConfig, TrackingState};
 use nalgebra::{Point3, Vector2, Vector3, Vector6};
 
 const CAMERA: Camera = Camera {
@@ -172,31 +172,6 @@ fn keyframes_close_together_are_culled_and_keep_their_poses() {
     };
     let (all, culled) = (run(false), run(true));
     assert!(all.0 == all.1 && all.0 > 25 && culled.1 + 5 <= culled.0, "{all:?}, {culled:?}");
-}
-
-#[test]
-fn false_pose_measurements_do_no_harm_and_nonsense_is_refused() {
-    let mut tracker = tracker();
-    for index in 0..16 {
-        tracker.track(&render(index, &truth(index)), true).unwrap();
-        let newest = tracker.keyframes().len() - 1;
-        let wrong = |keyframe_from_relative| PoseMeasurement {
-            keyframe: newest,
-            relative_to: 0,
-            keyframe_from_relative,
-            sigma_translation_metres: 0.001,
-            sigma_rotation_rad: 0.001,
-        };
-        if newest > 0 {
-            tracker.measure(&[wrong(Se3::translation(0.5, 0.0, index as f64))]).unwrap();
-        }
-        let nan = [wrong(Se3::translation(0.0, f64::NAN, 0.0))];
-        assert!(tracker.measure(&nan).unwrap_err().to_string().contains("refused"));
-    }
-    tracker.finish().unwrap();
-    for (index, pose) in tracker.trajectory() {
-        assert_close(&pose.world_from_camera, index);
-    }
 }
 
 #[test]

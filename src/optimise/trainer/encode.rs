@@ -12,10 +12,8 @@ impl Trainer {
     pub(super) fn encode_log(&self, encoder: &mut wgpu::CommandEncoder, log: &GpuBuffer, entry: usize) {
         let to = (entry * std::mem::size_of::<StepLog>()) as u64;
         let counters = &self.rasterizer.workspace.counters;
-        let [pose_at, counters_at] =
-            [std::mem::offset_of!(StepLog, pose), std::mem::offset_of!(StepLog, counters)].map(|at| at as u64);
-        encoder.copy_buffer_to_buffer(self.loss_total.raw(), 0, log.raw(), to, pose_at);
-        encoder.copy_buffer_to_buffer(self.pose_gradient.raw(), 0, log.raw(), to + pose_at, counters_at - pose_at);
+        let counters_at = std::mem::offset_of!(StepLog, counters) as u64;
+        encoder.copy_buffer_to_buffer(self.loss_total.raw(), 0, log.raw(), to, counters_at);
         encoder.copy_buffer_to_buffer(counters.raw(), 0, log.raw(), to + counters_at, counters.raw().size());
     }
 
@@ -77,22 +75,19 @@ impl Trainer {
             (1, &ws.counters),
             (2, &ws.intersection_counts),
             (3, &ws.intersection_gradients),
-            (4, &self.pose_sums),
-            (5, cloud.parameters()),
+            (4, cloud.parameters()),
         ];
         let arguments = IndirectSize { buffer: &ws.counters, offset: Counter::per_element_offset(VISIBLE_COUNTER) };
         let kernel = match sink {
             Sink::Adam => {
-                project.extend([(6, cloud.moments_1()), (7, cloud.moments_2()), (8, &self.adam), (9, cloud.averages())]);
+                project.extend([(5, cloud.moments_1()), (6, cloud.moments_2()), (7, &self.adam), (8, cloud.averages())]);
                 &k.project_backward_adam
             }
             Sink::Gradient(buffer) => {
-                project.push((6, *buffer));
+                project.push((5, *buffer));
                 &k.project_backward
             }
         };
         kernel.dispatch_indirect(gpu, pass, &project, arguments);
-        let reduce = [(0, &ws.counters), (1, &self.pose_sums), (2, &self.pose_gradient)];
-        k.pose_reduce.dispatch(gpu, pass, &reduce, [1, 1, 1]);
     }
 }

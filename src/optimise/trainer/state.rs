@@ -4,7 +4,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::Trainer;
-use crate::gpu::{Gpu, GpuBuffer, GpuError};
+use crate::gpu::GpuError;
 use crate::optimise::image_buffers;
 use crate::render::Capacities;
 
@@ -15,7 +15,6 @@ pub struct TrainerState {
     steps: usize,
     /// Width and height of the views that there are buffers for, the latest first.
     sizes: Vec<(u32, u32)>,
-    gaussians: usize,
     scored: usize,
     rasterizer: Capacities,
 }
@@ -26,7 +25,6 @@ impl Trainer {
         TrainerState {
             steps: self.steps,
             sizes: self.images.iter().map(|images| images.size).collect(),
-            gaussians: self.gaussians,
             scored: self.scores.capacity(),
             rasterizer: self.rasterizer.capacities(),
         }
@@ -43,16 +41,6 @@ impl Trainer {
         for size in state.sizes.iter().rev() {
             image_buffers::choose(&mut self.images, gpu, *size)?;
         }
-        self.reserve_gaussians(gpu, state.gaussians)?;
         if state.scored > 0 { self.scores.reserve(gpu, state.scored) } else { Ok(()) }
-    }
-
-    /// Room for the gradients by the pose of so many Gaussians.
-    pub(super) fn reserve_gaussians(&mut self, gpu: &Gpu, capacity: usize) -> Result<(), GpuError> {
-        if capacity > self.gaussians {
-            self.pose_sums = GpuBuffer::storage(gpu, "pose sums", (capacity as u64).div_ceil(256) * 32)?;
-            self.gaussians = capacity;
-        }
-        Ok(())
     }
 }

@@ -9,7 +9,7 @@ use crate::geometry::{Pinhole, Se3};
 use crate::tracking::TrackingConfig;
 use crate::tracking::map::sparse_map::{LandmarkState, Map, Observation};
 use crate::tracking::rig::Rig;
-use crate::tracking::solvers::bundle::{BundleObservation, BundleProblem, RelativePose};
+use crate::tracking::solvers::bundle::{BundleObservation, BundleProblem};
 use crate::tracking::solvers::residual::InlierClass;
 
 /// Keyframes that share fewer landmarks than this are not moved together.
@@ -157,13 +157,6 @@ fn make_problem(
         points: landmarks.iter().map(|l| map.landmarks[*l].position).collect(),
         ..Default::default()
     };
-    for m in map.measured.values() {
-        if let (Some(a), Some(b)) = (place[m.keyframe], place[m.relative_to])
-            && a.min(b) < free_poses
-        {
-            problem.relative.push(RelativePose { edge: m.edge(a, b), is_inlier: true });
-        }
-    }
     let mut observations = Vec::new();
     for (point, l) in landmarks.iter().enumerate() {
         for observation in &map.landmarks[*l].observations {

@@ -10,7 +10,6 @@ use crate::tracking::map::insertion::fuse;
 use crate::tracking::map::sparse_map::{LandmarkState, Map, Observation};
 use crate::tracking::rig::Rig;
 use crate::tracking::solvers::pose_graph::{Edge, PoseGraph};
-use crate::tracking::solvers::relative_pose::passes_gate;
 
 /// Keyframes that share this many landmarks are held to their relative pose, besides each one and the one it shares most with.
 const STRONG_SHARED: usize = 100;
@@ -48,15 +47,12 @@ pub fn correct(map: &mut Map, found: &Recognised, edges: &mut Vec<Edge>, scale_i
         ..edge(found.keyframe, found.place, keyframe_from_place, found.matches.len(), depth)
     });
     graph.edges.extend(edges.iter());
-    let measured = map.measured.values().map(|m| m.edge(m.keyframe, m.relative_to));
-    graph.edges.extend(measured.filter(|e| passes_gate(e, &before[e.a], &before[e.b])));
     graph.optimise(GRAPH_STEPS);
     move_map(map, &before, &graph.poses, config);
     let living: Vec<usize> = (0..before.len()).map(|k| map.living(k)).collect();
     let growth = |k: usize| 1.0 / graph.poses[living[k]].scale;
     map.culled.iter_mut().for_each(|(k, held)| held.camera_from_parent.translation.vector *= growth(*k));
     map.carry_culled();
-    map.measured.values_mut().for_each(|m| m.keyframe_from_relative.translation.vector *= growth(m.keyframe));
     let neighbours: Vec<usize> =
         map.covisible(found.keyframe).into_iter().filter(|(_, n)| *n >= CONNECTED_SHARED).map(|(k, _)| k).collect();
     take_over(map, found, config);

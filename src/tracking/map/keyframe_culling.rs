@@ -66,7 +66,6 @@ fn cull(map: &mut Map, keyframe: usize, config: &TrackingConfig) -> bool {
         *held = CulledKeyframe { parent, camera_from_parent: held.camera_from_parent * camera_from_parent };
     }
     map.culled.insert(keyframe, CulledKeyframe { parent, camera_from_parent });
-    map.move_pose_priors(keyframe);
     true
 }
 

@@ -3,7 +3,6 @@
 pub mod insertion;
 pub mod keyframe_culling;
 pub mod keyframe_database;
-pub mod pose_priors;
 pub mod sparse_map;
 pub mod triangulation;
 

@@ -15,7 +15,6 @@ use crate::tracking::features::frame_features::FrameFeatures;
 use crate::tracking::features::projection::Projection;
 use crate::tracking::map::keyframe_database::KeyframeDatabase;
 use crate::tracking::rig::Rig;
-use crate::tracking::solvers::relative_pose::PoseMeasurement;
 
 /// A landmark is looked for only within 60° of the mean direction from which it was seen.
 const MIN_VIEW_COSINE: f64 = 0.5;
@@ -84,8 +83,6 @@ pub struct Map {
     pub database: KeyframeDatabase,
     /// By keyframe; none is held by another culled one.
     pub culled: BTreeMap<usize, CulledKeyframe>,
-    /// By pair of living keyframes, the lower id first.
-    pub measured: BTreeMap<(usize, usize), PoseMeasurement>,
 }
 
 impl Map {

@@ -1,14 +1,11 @@
 //! Bundle adjustment: poses and points together, by Levenberg-Marquardt with the points eliminated by their Schur complement
-//! (Triggs et al., *Bundle adjustment: a modern synthesis*, 2000), Huber's kernel, depth residuals, and measured relative poses.
+//! (Triggs et al., *Bundle adjustment: a modern synthesis*, 2000), Huber's kernel, and depth residuals.
 //!
 //! Knows nothing of the map; `window.rs` makes the problem and takes the result. Sums run in the order of the observations.
 
 use nalgebra::{Matrix3, Matrix6, Matrix6x3, Point3, Vector3, Vector6};
 
-use crate::geometry::sim3::Matrix7;
-use crate::geometry::{Pinhole, Se3, Sim3, se3};
-use crate::tracking::solvers::pose_graph::{Edge, Linearised};
-use crate::tracking::solvers::relative_pose::passes_gate;
+use crate::geometry::{Pinhole, Se3, se3};
 use crate::tracking::solvers::residual::{InlierClass, Measurement, point_by_pose};
 use crate::tracking::solvers::schur::ReducedSystem;
 
@@ -26,14 +23,6 @@ pub struct BundleObservation {
     pub class: InlierClass,
 }
 
-/// A measured relative pose of two of the problem's poses.
-#[derive(Clone, Copy, Debug)]
-pub struct RelativePose {
-    /// Between rigid poses; its seventh weight is not used.
-    pub edge: Edge,
-    pub is_inlier: bool,
-}
-
 /// Bundle adjustment problem.
 #[derive(Clone, Debug, Default)]
 pub struct BundleProblem {
@@ -45,7 +34,6 @@ pub struct BundleProblem {
     pub points: Vec<Point3<f64>>,
     /// Sorted by point.
     pub observations: Vec<BundleObservation>,
-    pub relative: Vec<RelativePose>,
 }
 
 /// An observation's share of the normal equations.
@@ -63,8 +51,6 @@ struct System {
     gradient_points: Vec<Vector3<f64>>,
     /// Blocks of free poses, sorted by point.
     mixed: Vec<Mixed>,
-    /// Blocks of two free poses with a relative pose factor: row, column (the lower), block.
-    ties: Vec<(usize, usize, Matrix6<f64>)>,
 }
 
 impl BundleProblem {
@@ -105,25 +91,16 @@ impl BundleProblem {
         (initial, cost)
     }
 
-    /// Judges every observation anew by χ², and relative poses by how far they are off.
+    /// Judges every observation anew by χ².
     pub fn classify(&mut self, pinhole: &Pinhole) {
         for o in &mut self.observations {
             o.class = o.measurement.classify(pinhole, &(self.poses[o.pose] * self.points[o.point]).coords);
         }
-        for r in &mut self.relative {
-            r.is_inlier = passes_gate(&r.edge, &self.poses[r.edge.a], &self.poses[r.edge.b]);
-        }
-    }
-
-    /// Squared residual of a relative pose.
-    fn off(&self, edge: &Edge) -> f64 {
-        edge.residual(&Sim3::from(self.poses[edge.a]), &Sim3::from(self.poses[edge.b])).norm_squared()
     }
 
     /// The robust cost of all trusted observations. Infinite if a point lies behind a camera that sees it, so that no step goes there.
     pub fn cost(&self, pinhole: &Pinhole) -> f64 {
-        let inliers = self.relative.iter().filter(|r| r.is_inlier);
-        let mut sum: f64 = inliers.map(|r| r.edge.robust(self.off(&r.edge)).0).sum();
+        let mut sum = 0.0;
         for o in &self.observations {
             let Some(measurement) = o.measurement.restricted_to(o.class) else { continue };
             match measurement.residual(pinhole, &(self.poses[o.pose] * self.points[o.point]).coords) {
@@ -141,9 +118,7 @@ impl BundleProblem {
             hessian_points: vec![Matrix3::zeros(); self.points.len()],
             gradient_points: vec![Vector3::zeros(); self.points.len()],
             mixed: Vec::with_capacity(self.observations.len()),
-            ties: Vec::new(),
         };
-        self.linearise_relative(&mut system);
         for (index, o) in self.observations.iter().enumerate() {
             let Some(measurement) = o.measurement.restricted_to(o.class) else { continue };
             let pose = &self.poses[o.pose];
@@ -166,24 +141,6 @@ impl BundleProblem {
         system
     }
 
-    fn linearise_relative(&self, system: &mut System) {
-        for RelativePose { edge, .. } in self.relative.iter().filter(|r| r.is_inlier) {
-            let Linearised { residual, by_a, by_b } =
-                edge.linearise(&Sim3::from(self.poses[edge.a]), &Sim3::from(self.poses[edge.b]));
-            let weight = edge.robust(residual.norm_squared()).1;
-            let rigid = |by: &Matrix7| by.fixed_view::<6, 6>(0, 0).into_owned();
-            let sides = [(edge.a, rigid(&by_a)), (edge.b, rigid(&by_b))];
-            for (pose, by_pose) in sides.iter().filter(|(pose, _)| *pose < self.free_poses) {
-                system.hessian_poses[*pose] += by_pose.transpose() * by_pose * weight;
-                system.gradient_poses[*pose] += by_pose.transpose() * residual.fixed_rows::<6>(0) * weight;
-            }
-            let [low, high] = if edge.a < edge.b { sides } else { [sides[1], sides[0]] };
-            if high.0 < self.free_poses {
-                system.ties.push((high.0, low.0, high.1.transpose() * low.1 * weight));
-            }
-        }
-    }
-
     /// Sparsity of the reduced camera system; `None` if it has too many blocks.
     fn reduced_system(&self) -> Option<ReducedSystem> {
         let is_free = |pose: &usize| *pose < self.free_poses;
@@ -192,8 +149,7 @@ impl BundleProblem {
             let pairs: Vec<(usize, usize)> = poses.iter().flat_map(|a| poses.iter().map(|b| (*a, *b))).collect();
             pairs
         });
-        let tied = self.relative.iter().map(|r| (r.edge.a, r.edge.b)).filter(|(a, b)| is_free(a) && is_free(b));
-        ReducedSystem::new(self.free_poses, seen.chain(tied))
+        ReducedSystem::new(self.free_poses, seen)
     }
 
     /// Takes one damped step; `false` if the equations cannot be solved.
@@ -235,9 +191,6 @@ impl BundleProblem {
             let damped = &mut blocks[reduced.place(k, k)];
             *damped = *h;
             (0..6).for_each(|i| damped[(i, i)] += lambda * h[(i, i)] + 1e-9);
-        }
-        for (row, column, block) in &system.ties {
-            blocks[reduced.place(*row, *column)] += block;
         }
         let point_of = |m: &Mixed| self.observations[m.observation].point;
         for group in system.mixed.chunk_by(|a, b| point_of(a) == point_of(b)) {

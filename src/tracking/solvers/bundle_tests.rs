@@ -1,10 +1,8 @@
-//! Bundle adjustment on made-up scenes: against the truth, against the full equations, and with relative poses true and false.
+//! Bundle adjustment on made-up scenes: against the truth, and against the full equations.
 
 use nalgebra::{DMatrix, DVector, Vector2};
-use proptest::prelude::*;
 
 use super::*;
-use crate::tracking::solvers::relative_pose::PoseMeasurement;
 use crate::tracking::solvers::residual::tests::PINHOLE;
 
 fn noise(random: &mut fastrand::Rng) -> f64 {
@@ -43,25 +41,6 @@ fn scene(pixel_noise: f64, outliers: bool) -> (BundleProblem, BundleProblem) {
     (problem, truth)
 }
 
-/// The relative pose of two of a problem's poses, off by `error`.
-fn measured(problem: &BundleProblem, a: usize, b: usize, error: Se3) -> RelativePose {
-    let measurement = PoseMeasurement {
-        keyframe: a,
-        relative_to: b,
-        keyframe_from_relative: error * problem.poses[a] * problem.poses[b].inverse(),
-        sigma_translation_metres: 0.001,
-        sigma_rotation_rad: 0.001,
-    };
-    RelativePose { edge: measurement.edge(a, b), is_inlier: true }
-}
-
-fn settle(problem: &mut BundleProblem) {
-    for _ in 0..2 {
-        problem.solve(&PINHOLE, 10);
-        problem.classify(&PINHOLE);
-    }
-}
-
 fn worst_pose_error(problem: &BundleProblem, truth: &BundleProblem) -> f64 {
     let errors = problem.poses.iter().zip(&truth.poses).map(|(a, b)| se3::log(&(a * b.inverse())).norm());
     errors.fold(0.0, f64::max)
@@ -96,12 +75,9 @@ fn outliers_are_found_and_do_not_pull() {
 #[test]
 fn the_reduced_system_steps_as_the_full_one_does() {
     let (problem, _) = scene(0.5, false);
-    let mut problem =
+    let problem =
         BundleProblem { points: problem.points[..8].to_vec(), observations: problem.observations[..48].to_vec(), ..problem };
-    problem.relative =
-        vec![measured(&problem, 0, 2, Se3::identity()), measured(&problem, 5, 3, Se3::translation(0.002, 0.0, 0.0))];
     let system = problem.linearise(&PINHOLE);
-    assert_eq!(system.ties.len(), 1);
     let (lambda, poses, size) = (1e-3, 24, 24 + 24);
     let (mut full, mut right) = (DMatrix::zeros(size, size), DVector::zeros(size));
     for k in 0..4 {
@@ -117,10 +93,6 @@ fn the_reduced_system_steps_as_the_full_one_does() {
         full.fixed_view_mut::<6, 3>(6 * m.pose, poses + 3 * point).copy_from(&m.pose_by_point);
         full.fixed_view_mut::<3, 6>(poses + 3 * point, 6 * m.pose).copy_from(&m.pose_by_point.transpose());
     }
-    for (row, column, block) in &system.ties {
-        full.fixed_view_mut::<6, 6>(6 * row, 6 * column).copy_from(block);
-        full.fixed_view_mut::<6, 6>(6 * column, 6 * row).copy_from(&block.transpose());
-    }
     (0..size).for_each(|k| full[(k, k)] += lambda * full[(k, k)] + 1e-9);
     let expected = full.lu().solve(&right).unwrap();
     let mut stepped = problem.clone();
@@ -133,71 +105,4 @@ fn the_reduced_system_steps_as_the_full_one_does() {
     for k in 0..8 {
         assert!((stepped.points[k] - problem.points[k] - expected.rows(poses + 3 * k, 3)).norm() < 1e-8);
     }
-}
-
-proptest! {
-    #[test]
-    fn relative_poses_have_the_numerical_derivatives(
-        poses in prop::array::uniform3(prop::array::uniform6(-0.6f64..0.6)), sigmas in prop::array::uniform2(0.5f64..2.0)
-    ) {
-        let [a, b, measured] = poses.map(|tau| se3::exp(&Vector6::from(tau)));
-        let edge = PoseMeasurement {
-            keyframe: 1, relative_to: 0, keyframe_from_relative: measured, sigma_translation_metres: sigmas[0],
-            sigma_rotation_rad: sigmas[1],
-        }.edge(1, 0);
-        let edge = Edge { huber: None, ..edge };
-        let relative = vec![RelativePose { edge, is_inlier: true }];
-        let problem = BundleProblem { poses: vec![b, a], free_poses: 2, relative, ..Default::default() };
-        let system = problem.linearise(&PINHOLE);
-        // Columns: the steps of both poses.
-        let mut numeric = DMatrix::zeros(7, 12);
-        for k in 0..12 {
-            let mut step = Vector6::zeros();
-            step[k % 6] = 1e-6;
-            let at = |step: Vector6<f64>| {
-                let mut poses = [b, a];
-                poses[k / 6] = se3::exp(&step) * poses[k / 6];
-                edge.residual(&Sim3::from(poses[1]), &Sim3::from(poses[0]))
-            };
-            numeric.set_column(k, &((at(step) - at(-step)) / 2e-6));
-        }
-        let residual = edge.residual(&Sim3::from(a), &Sim3::from(b));
-        let (hessian, gradient) = (numeric.transpose() * &numeric, numeric.transpose() * residual);
-        prop_assert_eq!((system.ties.len(), system.ties[0].0, system.ties[0].1), (1, 1, 0));
-        let expected = |row: usize, column: usize| hessian.fixed_view::<6, 6>(6 * row, 6 * column).into_owned();
-        for k in 0..2 {
-            prop_assert!((system.hessian_poses[k] - expected(k, k)).norm() < 1e-5 * (1.0 + hessian.norm()));
-            prop_assert!((system.gradient_poses[k] - gradient.fixed_rows::<6>(6 * k)).norm() < 1e-5 * (1.0 + gradient.norm()));
-        }
-        prop_assert!((system.ties[0].2 - expected(1, 0)).norm() < 1e-5 * (1.0 + hessian.norm()));
-    }
-}
-
-#[test]
-fn a_wildly_wrong_relative_pose_does_not_move_what_landmarks_hold() {
-    let (mut without, truth) = scene(0.5, false);
-    let mut with = without.clone();
-    for (a, b, off) in [(1, 5, 1.0), (2, 3, -0.3), (0, 4, 0.05)] {
-        let wrong = se3::exp(&Vector6::new(off, 0.5 * off, -off, 0.3 * off, off, -0.2 * off));
-        with.relative.push(measured(&truth, a, b, wrong));
-    }
-    settle(&mut without);
-    settle(&mut with);
-    assert!(with.relative.iter().all(|r| !r.is_inlier));
-    for (a, b) in with.poses.iter().zip(&without.poses) {
-        let apart = a * b.inverse();
-        assert!(apart.translation.vector.norm() < 1e-3 && apart.rotation.angle() < 1e-3, "{apart}");
-    }
-}
-
-#[test]
-fn a_good_relative_pose_helps_what_few_landmarks_hold() {
-    let (mut without, truth) = scene(1.0, false);
-    without.observations.retain(|o| o.pose != 0 || o.point % 20 == 0);
-    let mut with = without.clone();
-    with.relative.push(measured(&truth, 5, 0, se3::exp(&Vector6::new(5e-4, -3e-4, 2e-4, 1e-4, 3e-4, -2e-4))));
-    settle(&mut without);
-    settle(&mut with);
-    let off = |problem: &BundleProblem| se3::log(&(problem.poses[0] * truth.poses[0].inverse())).norm();
-    assert!(with.relative[0].is_inlier && off(&with) < 0.4 * off(&without), "{} → {}", off(&without), off(&with));
 }

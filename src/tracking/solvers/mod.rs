@@ -4,7 +4,6 @@ pub mod bundle;
 pub mod epipolar;
 pub mod pose;
 pub mod pose_graph;
-pub mod relative_pose;
 pub mod residual;
 pub mod schur;
 pub mod sim3_alignment;

@@ -13,7 +13,7 @@ use crate::tracking::adjustment::local_bundle::Adjustment;
 use crate::tracking::adjustment::thread::Worker;
 use crate::tracking::loop_closing::MovedKeyframe;
 use crate::tracking::map::keyframe_culling::cull_around;
-use crate::tracking::{KeyframeUpdate, PoseMeasurement, StageTimes, TrackingError};
+use crate::tracking::{KeyframeUpdate, StageTimes, TrackingError};
 
 /// Deterministic replay: frames after its keyframe at which an adjustment is taken in, at most, and as a share of those since the keyframe before:
 /// where keyframes follow each other closely the map must not lag behind. Points that were only triangulated are poor until they are
@@ -64,17 +64,6 @@ impl Tracker {
     pub fn finish(&mut self) -> Result<Vec<KeyframeUpdate>, TrackingError> {
         self.take_all_adjusted(&mut StageTimes::default())?;
         Ok(self.updates())
-    }
-
-    /// Takes in relative poses of keyframes measured elsewhere, each in place of an earlier one of the same pair. The next
-    /// adjustments of these keyframes contain them as factors.
-    ///
-    /// # Errors
-    /// [`TrackingError::Measurement`] if one has a number that is not finite or out of range, or an unknown keyframe; then none is taken.
-    pub fn measure(&mut self, measurements: &[PoseMeasurement]) -> Result<(), TrackingError> {
-        measurements.iter().try_for_each(|m| m.check(self.map.keyframes.len()))?;
-        measurements.iter().for_each(|m| self.map.add_pose_prior(*m));
-        Ok(())
     }
 
     /// Has the surroundings of a new keyframe adjusted, now or when the worker is free.

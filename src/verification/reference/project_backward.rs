@@ -1,36 +1,24 @@
-//! Gradient through the projection to the raw parameters and the camera pose; twin of `shaders/project_backward.wgsl`, in matrices.
+//! Gradient through the projection to the raw parameters; twin of `shaders/project_backward.wgsl`, in matrices.
 
-use nalgebra::{Matrix2, Matrix2x3, Matrix3, Vector2, Vector3, Vector4, Vector6};
+use nalgebra::{Matrix2, Matrix2x3, Matrix3, Vector2, Vector3, Vector4};
 
 use super::project_forward::{Projected64, camera_rotation, rotation_matrix};
 use super::rasterize_backward;
 use super::rasterize_forward::sorted;
 use super::{Gaussian64, ImageGradient64, ProjectedGradient, View64, spherical_harmonics};
 
-/// Gradient of a loss by everything that a rendered view depends on.
-#[derive(Clone, Debug)]
-pub struct Gradient64 {
-    /// By each Gaussian of the map; zero where it was not drawn.
-    pub cloud: Vec<Gaussian64>,
-    /// By the pose, τ = (ρ, θ) of `camera_from_world ← Exp(τ)·camera_from_world`.
-    pub pose: Vector6<f64>,
-}
-
-/// The whole backward pass, from the image's gradient to the parameters' and the pose's.
-pub fn backward(view: &View64, cloud: &[Gaussian64], by_image: &ImageGradient64) -> Gradient64 {
+/// The whole backward pass, from the image's gradient to that of each Gaussian's raw parameters: zero where it was not drawn.
+pub fn backward(view: &View64, cloud: &[Gaussian64], by_image: &ImageGradient64) -> Vec<Gaussian64> {
     let sorted = sorted(view, cloud);
     let by_projected = rasterize_backward::backward(view, &sorted, by_image);
-    let zero = |g: &Gaussian64| Gaussian64::from_flat(&vec![0.0; g.flat().len()]);
-    let mut gradient = Gradient64 { cloud: cloud.iter().map(zero).collect(), pose: Vector6::zeros() };
+    let mut gradient: Vec<Gaussian64> = cloud.iter().map(|g| Gaussian64::from_flat(&vec![0.0; g.flat().len()])).collect();
     for ((i, projected), by) in sorted.iter().zip(&by_projected) {
-        let (own, pose) = project_backward(view, &cloud[*i], projected, by);
-        gradient.cloud[*i] = own;
-        gradient.pose += pose;
+        gradient[*i] = project_backward(view, &cloud[*i], projected, by);
     }
     gradient
 }
 
-fn project_backward(view: &View64, g: &Gaussian64, f: &Projected64, by: &ProjectedGradient) -> (Gaussian64, Vector6<f64>) {
+fn project_backward(view: &View64, g: &Gaussian64, f: &Projected64, by: &ProjectedGradient) -> Gaussian64 {
     let rotation = camera_rotation(view);
     // Σ⁻¹ = P: dΣ = -P⁻¹dP P⁻¹, hence ∂L/∂Σ = -P G P with G symmetric.
     let by_conic = Matrix2::new(by.conic.x, by.conic.y / 2.0, by.conic.y / 2.0, by.conic.z);
@@ -51,23 +39,13 @@ fn project_backward(view: &View64, g: &Gaussian64, f: &Projected64, by: &Project
     let by_rotation = by_axes_in_world * Matrix3::from_diagonal(&scale);
     let by_unit = quaternion_gradient(&q, &by_rotation);
     let world_axes = rotation_matrix(&q) * Matrix3::from_diagonal(&scale);
-    let own = Gaussian64 {
+    Gaussian64 {
         mean: rotation.transpose() * by_point + by_mean_of_color,
         log_scale: Vector3::from_fn(|k, _| by_axes_in_world.column(k).dot(&world_axes.column(k))),
         rotation: (by_unit - q * q.dot(&by_unit)) / g.rotation.norm(),
         raw_opacity: by.opacity * f.opacity * (1.0 - f.opacity),
         sh: (0..g.sh.len()).map(|k| free * spherical_harmonics::basis(k, &f.direction)).collect(),
-    };
-    let rho = by_point + rotation * by_mean_of_color;
-    // Σc' = Exp(θ)Σc Exp(-θ): with Q = 2ΣcM, M = JᵀGJ, its gradient is the vector of Q - Qᵀ.
-    let in_camera = 2.0 * f.axes * f.axes.transpose() * f.jacobian.transpose() * by_covariance * f.jacobian;
-    let by_turn = Vector3::new(
-        in_camera[(1, 2)] - in_camera[(2, 1)],
-        in_camera[(2, 0)] - in_camera[(0, 2)],
-        in_camera[(0, 1)] - in_camera[(1, 0)],
-    );
-    let theta = f.p_in_camera.cross(&by_point) + by_turn;
-    (own, Vector6::new(rho.x, rho.y, rho.z, theta.x, theta.y, theta.z))
+    }
 }
 
 /// Through the image mean, the depth, and J's dependence on the mean (its own z, and x/z, y/z where these were not clamped).
