@@ -47,9 +47,7 @@ impl Preset {
             Self::Realtime => {
                 config.replay.real_time = true;
                 mapping.yields_to_keyframes = true;
-                // The time left after these steps goes to consolidation, which gains more a step.
                 mapping.first_iterations = 10;
-                mapping.iterations_per_keyframe = 10;
                 mapping.window.recent = 4;
                 mapping.window.covisible = 2;
                 // Few steps fit between two keyframes, and density control costs about six of them: it runs after every fifth keyframe, and
@@ -62,8 +60,7 @@ impl Preset {
             Self::Draft => {
                 // With so few steps a keyframe's own are best kept for the end.
                 mapping.first_iterations = 20;
-                mapping.iterations_per_keyframe = 3;
-                mapping.refine.growth = 0.0;
+                mapping.refine.steps_per_keyframe = 0;
                 mapping.refine.final_epochs = 6;
             }
             Self::Balanced => {}

@@ -51,7 +51,7 @@ impl Default for MappingConfig {
     fn default() -> Self {
         Self {
             sh_degree: ShDegree::new(2).expect("degrees 0 to 3 exist"),
-            iterations_per_keyframe: 5,
+            iterations_per_keyframe: 3,
             first_iterations: 50,
             yields_to_keyframes: false,
             seed: 0,
@@ -212,15 +212,12 @@ impl Default for PointsConfig {
     }
 }
 
-/// Consolidation: seeded, shuffled epochs over all keyframes with images, in online sessions and after the last keyframe.
+/// Consolidation: seeded, shuffled epochs over all keyframes with images, online and after the last keyframe.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RefineConfig {
-    /// An online session follows a keyframe once their number has grown by this share since the last session; 0: none. The sessions' total
-    /// cost is linear in the number of keyframes.
-    pub growth: f32,
-    /// Epochs of an online session: steps of each keyframe.
-    pub session_epochs: usize,
+    /// Steps of the running epoch that follow each keyframe.
+    pub steps_per_keyframe: usize,
     /// Epochs after the last keyframe.
     pub final_epochs: usize,
     /// Least steps after the last keyframe, one view each, whatever the number of keyframes. Without steps and epochs the map stays as it is.
@@ -247,9 +244,6 @@ pub struct RefineConfig {
 impl RefineConfig {
     /// Checks every value but the shares and rates.
     fn validate(&self) -> Result<(), String> {
-        if !(self.growth.is_finite() && self.growth >= 0.0) {
-            return Err(format!("growth must be zero or more, not {}", self.growth));
-        }
         if self.seconds.is_some_and(|seconds| !(seconds.is_finite() && seconds >= 0.0)) {
             return Err("seconds must be zero or more".into());
         }
@@ -263,9 +257,8 @@ impl RefineConfig {
 impl Default for RefineConfig {
     fn default() -> Self {
         Self {
-            growth: 1.0,
-            session_epochs: 3,
-            final_epochs: 20,
+            steps_per_keyframe: 8,
+            final_epochs: 18,
             steps: 0,
             seconds: None,
             all_tiles: true,
@@ -283,8 +276,7 @@ impl MappingConfig {
     /// For recordings whose poses are known: keyframes only arrive, and the refinement makes the map.
     pub fn offline() -> Self {
         let refine = RefineConfig {
-            growth: 0.0,
-            session_epochs: 0,
+            steps_per_keyframe: 0,
             final_epochs: 0,
             steps: 6000,
             all_tiles: false,

@@ -73,8 +73,8 @@ pub struct Mapper {
     images: ImageStore,
     rng: Rng,
     step_times: Vec<Duration>,
-    /// Keyframes at the last online session of consolidation.
-    consolidated: usize,
+    /// Keyframes left of the running epoch of consolidation.
+    epoch: Vec<usize>,
     /// Whether the adapter has no room for more Gaussians, which is reported once.
     is_full: bool,
 }
@@ -94,7 +94,7 @@ impl Mapper {
             images: ImageStore::new(config.limits.max_host_bytes),
             rng: Rng::with_seed(config.seed),
             step_times: Vec::new(),
-            consolidated: 0,
+            epoch: Vec::new(),
             is_full: false,
             gpu,
         })

@@ -187,8 +187,7 @@ impl MapThread<'_> {
         checkpoints: &mut Checkpoints,
         on_round: &mut dyn FnMut(Round<'_>),
     ) -> Result<(), PipelineError> {
-        let first = mapper.begin_refinement()?;
-        let mut refinement = begun.unwrap_or(first);
+        let mut refinement = begun.map_or_else(|| mapper.begin_refinement(), Ok)?;
         while let Some(report) = mapper.refine(&mut refinement, &|| self.progress.stopped())? {
             tracing::debug!(?report, "refined");
             summary.expose(&mapper.exposures().collect());

@@ -28,6 +28,7 @@ fn density_is_controlled_after_every_so_many_keyframes() {
         let mut config = MappingConfig { first_iterations: 5, iterations_per_keyframe: 5, ..Default::default() };
         // No inserted Gaussian is as opaque as this.
         (config.density.every, config.density.min_opacity) = (every, 0.95);
+        config.refine.steps_per_keyframe = 0;
         let mut mapper = Mapper::new(gpu.clone(), &config).unwrap();
         for id in 0..6 {
             let report = mapper.insert(&keyframe(id, true), &|| false).unwrap();
@@ -129,7 +130,7 @@ fn keyframes_before_the_first_depth_are_passed_over() {
     let resumed = resume(&mapper.state(None).unwrap(), &[keyframe(0, false), keyframe(1, false)]);
     assert!(resumed.has_not_begun());
     let begun = mapper.insert(&keyframe(2, true), &|| false).unwrap();
-    assert!(begun.inserted > 0 && begun.iterations == 5, "{begun:?}");
+    assert!(begun.inserted > 0 && begun.iterations == 5 + config.refine.steps_per_keyframe, "{begun:?}");
     let mut resumed = resume(&mapper.state(None).unwrap(), &[keyframe(0, false), keyframe(1, false), keyframe(2, true)]);
     resumed.insert(&keyframe(3, true), &|| false).unwrap();
     mapper.insert(&keyframe(3, true), &|| false).unwrap();
@@ -138,19 +139,17 @@ fn keyframes_before_the_first_depth_are_passed_over() {
     assert!(after.inserted == 0 && after.iterations > 0 && after.gaussians > 0, "{after:?}");
 }
 
-/// Sessions of consolidation come at 8, 16 and 32 keyframes when their number has to double, and only where images are left.
+/// Steps of the running epoch follow each keyframe.
 #[test]
-fn online_sessions_follow_the_growth_of_the_keyframes() {
+fn steps_over_all_keyframes_follow_each_one() {
     let Some(gpu) = adapter() else { return };
     let mut config = MappingConfig { first_iterations: 5, iterations_per_keyframe: 5, ..Default::default() };
-    (config.refine.growth, config.refine.session_epochs, config.refine.all_tiles) = (1.0, 2, true);
-    let steps = |config: &MappingConfig, mapper: &mut Mapper, ids: std::ops::Range<usize>| -> Vec<usize> {
-        ids.map(|id| mapper.insert(&keyframe(id, true), &|| false).unwrap().iterations - config.iterations_per_keyframe).collect()
+    config.refine.steps_per_keyframe = 3;
+    let insert = |mapper: &mut Mapper, ids: std::ops::Range<usize>| {
+        ids.for_each(|id| assert_eq!(mapper.insert(&keyframe(id, true), &|| false).unwrap().iterations, 5 + 3));
     };
-    let sessions =
-        |steps: &[usize]| -> Vec<(usize, usize)> { (0..).zip(steps.iter().copied()).filter(|(_, s)| *s > 0).collect() };
     let mut mapper = Mapper::new(gpu.clone(), &config).unwrap();
-    assert_eq!(sessions(&steps(&config, &mut mapper, 0..40)), [(7, 16), (15, 32), (31, 64)]);
+    insert(&mut mapper, 0..40);
 
     // Where the images are makes no difference: on the GPU, in memory, in a file.
     let whole = mapper.download().unwrap();
@@ -158,17 +157,17 @@ fn online_sessions_follow_the_growth_of_the_keyframes() {
         let mut bounded = config.clone();
         (bounded.limits.max_gpu_images, bounded.limits.max_host_bytes) = (10, max_host_bytes);
         let mut mapper = Mapper::new(gpu.clone(), &bounded).unwrap();
-        assert_eq!(sessions(&steps(&bounded, &mut mapper, 0..40)), [(7, 16), (15, 32), (31, 64)]);
+        insert(&mut mapper, 0..40);
         assert_eq!(mapper.download().unwrap(), whole, "{max_host_bytes} bytes");
     }
 
-    // A resumed mapper knows when the last session was.
+    // A resumed mapper continues the epoch.
     let mut mapper = Mapper::new(gpu.clone(), &config).unwrap();
-    steps(&config, &mut mapper, 0..12);
+    insert(&mut mapper, 0..12);
     let state = mapper.state(None).unwrap();
     let mut resumed = Mapper::restore(gpu, &config, &state).unwrap();
     (0..12).for_each(|id| resumed.insert_again(&keyframe(id, true), &state).unwrap());
-    assert_eq!(steps(&config, &mut resumed, 12..17), steps(&config, &mut mapper, 12..17));
+    [&mut mapper, &mut resumed].into_iter().for_each(|mapper| insert(mapper, 12..17));
     assert_eq!(mapper.download().unwrap(), resumed.download().unwrap());
 }
 

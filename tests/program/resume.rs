@@ -163,7 +163,7 @@ fn consolidation_ends_as_in_an_unbroken_run() {
     if skipped_without_adapter() {
         return;
     }
-    let settings = ["tracking.keyframe_translation=0.005", "mapping.refine.growth=0.5", "mapping.refine.session_epochs=1"];
+    let settings = ["tracking.keyframe_translation=0.005", "mapping.refine.steps_per_keyframe=3"];
     let final_epochs = ["--set", "mapping.refine.final_epochs=2", "--set", "mapping.refine.density_every=15"];
     let more: Vec<&str> = settings.iter().flat_map(|s| ["--set", s]).chain(final_epochs).collect();
     survives("consolidated", recording(), &more, 11);

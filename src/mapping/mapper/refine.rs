@@ -1,6 +1,6 @@
 //! Consolidation: steps over all keyframes. Each epoch draws every keyframe once, in a seeded shuffle.
 //!
-//! Online sessions follow keyframes at constant rates. The final refinement follows the last keyframe: steps at half size first, then at full
+//! Online, some steps of the running epoch follow each keyframe, at constant rates. The final refinement follows the last keyframe: steps at half size first, then at full
 //! size, with density control in between; rates fall exponentially, as 3DGS has it for positions.
 
 use std::time::Instant;
@@ -12,9 +12,6 @@ use crate::optimise::{AdamConfig, StepReport};
 
 use super::{BATCH, Mapper, Step};
 
-/// Fewer keyframes are all in the window; an online session would repeat its steps.
-const FIRST_SESSION: usize = 8;
-
 /// Where a refinement stands; begun by [`Mapper::begin_refinement`].
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct FinalRefinement {
@@ -22,8 +19,6 @@ pub struct FinalRefinement {
     /// Rates at the beginning.
     adam: AdamConfig,
     done: usize,
-    /// Keyframes left of this epoch.
-    epoch: Vec<usize>,
     rounds: usize,
     /// Measurements of the exposures so far.
     pub(super) exposed: usize,
@@ -69,42 +64,31 @@ impl FinalRefinement {
 }
 
 impl Mapper {
-    /// Runs an online session if one is due, until `stop`; where steps yield to keyframes, without end. Returns the number of steps.
+    /// Takes the online steps that follow a keyframe, until `stop`; where steps yield to keyframes, without end. Returns their number.
     ///
     /// # Errors
     /// [`MappingError`] if a buffer does not fit or the device fails.
     pub(super) fn consolidate(&mut self, stop: &dyn Fn() -> bool) -> Result<usize, MappingError> {
         let config = self.config.clone();
-        let mut views = self.views();
-        let epochs = self.epochs_due(views.len());
+        let steps = if config.yields_to_keyframes { usize::MAX } else { config.refine.steps_per_keyframe };
         let mut done = 0;
-        for _ in 0..epochs {
-            self.rng.shuffle(&mut views);
-            for batch in views.chunks(self.batch()) {
-                if stop() {
-                    return Ok(done);
-                }
-                let batch: Vec<Step> = batch.iter().map(|&keyframe| Step { keyframe, coarse: false, lr_scale: 1.0 }).collect();
-                done += self.consolidation_steps(&batch, &config.adam)?.len();
-            }
+        while done < steps && !self.cloud.is_empty() && !stop() {
+            let batch = self.draw(self.batch().min(steps - done), false);
+            done += self.consolidation_steps(&batch, &config.adam)?.len();
         }
         Ok(done)
     }
 
-    /// Epochs of the online session that is due with so many `views`.
-    fn epochs_due(&mut self, views: usize) -> usize {
-        let RefineConfig { growth, session_epochs, .. } = self.config.refine;
-        let due = ((1.0 + growth) * self.consolidated as f32).max(FIRST_SESSION as f32);
-        if self.cloud.is_empty() || views == 0 {
-            0
-        } else if self.config.yields_to_keyframes {
-            usize::MAX
-        } else if growth > 0.0 && views as f32 >= due {
-            self.consolidated = views;
-            session_epochs
-        } else {
-            0
-        }
+    /// So many steps of the running epoch.
+    fn draw(&mut self, count: usize, coarse: bool) -> Vec<Step> {
+        let mut next = || {
+            if self.epoch.is_empty() {
+                self.epoch = (0..self.keyframes.len()).collect();
+                self.rng.shuffle(&mut self.epoch);
+            }
+            self.epoch.pop()
+        };
+        (0..count).filter_map(|_| next()).map(|keyframe| Step { keyframe, coarse, lr_scale: 1.0 }).collect()
     }
 
     /// All keyframes, ascending.
@@ -128,7 +112,8 @@ impl Mapper {
             None => config.steps.max(config.final_epochs * self.views().len()),
         };
         let started = config.seconds.map(|_| Instant::now());
-        Ok(FinalRefinement { adam: self.config.adam.clone(), config, done: 0, epoch: Vec::new(), rounds: 0, exposed: 0, started })
+        self.epoch.clear();
+        Ok(FinalRefinement { adam: self.config.adam.clone(), config, done: 0, rounds: 0, exposed: 0, started })
     }
 
     /// The steps up to the next density control, and that; `None` when all are done, or `stop` says so.
@@ -151,9 +136,7 @@ impl Mapper {
         let end = steps.min(refinement.done + density_every);
         while refinement.done < end && !refinement.is_done() && !stop() {
             let coarse = refinement.progress() < half_size_share;
-            let keyframes: Vec<usize> =
-                (refinement.done..end.min(refinement.done + BATCH)).map(|_| self.draw_from(refinement)).collect();
-            let batch: Vec<Step> = keyframes.into_iter().map(|keyframe| Step { keyframe, coarse, lr_scale: 1.0 }).collect();
+            let batch = self.draw(BATCH.min(end - refinement.done), coarse);
             adam = refinement.rates();
             for report in self.consolidation_steps(&batch, &adam)? {
                 psnr = (psnr.0 + report.loss.psnr_db(), psnr.1 + 1);
@@ -164,14 +147,6 @@ impl Mapper {
         let (pruned, grown) = if !refinement.is_done() { self.score_and_control(refinement, &density, &adam)? } else { (0, 0) };
         let psnr_db = psnr.0 / psnr.1.max(1) as f32;
         Ok(Some(RefineReport { steps_done: refinement.done, pruned, grown, gaussians: self.cloud.len(), psnr_db }))
-    }
-
-    fn draw_from(&mut self, refinement: &mut FinalRefinement) -> usize {
-        if refinement.epoch.is_empty() {
-            refinement.epoch = self.views();
-            self.rng.shuffle(&mut refinement.epoch);
-        }
-        refinement.epoch.pop().unwrap_or_default()
     }
 
     /// Density control by views spread over all keyframes, others in each round.

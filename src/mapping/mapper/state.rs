@@ -23,8 +23,8 @@ pub struct MapperState {
     keyframes: Vec<KeyframeState>,
     rng: u64,
     step_times: Vec<Duration>,
-    /// Keyframes at the last online session.
-    consolidated: usize,
+    /// Keyframes left of the running epoch.
+    epoch: Vec<usize>,
     refinement: Option<FinalRefinement>,
 }
 
@@ -41,7 +41,7 @@ impl Mapper {
             keyframes: self.keyframes.iter().map(|keyframe| keyframe.state(&self.gpu, &self.images)).collect::<Result<_, _>>()?,
             rng: self.rng.get_seed(),
             step_times: self.step_times.clone(),
-            consolidated: self.consolidated,
+            epoch: self.epoch.clone(),
             refinement: refinement.cloned(),
         })
     }
@@ -60,7 +60,7 @@ impl Mapper {
         mapper.stats = state.stats.clone();
         mapper.rng = Rng::with_seed(state.rng);
         mapper.step_times = state.step_times.clone();
-        mapper.consolidated = state.consolidated;
+        mapper.epoch = state.epoch.clone();
         Ok(mapper)
     }
 
