@@ -51,7 +51,7 @@ impl Default for MappingConfig {
     fn default() -> Self {
         Self {
             sh_degree: ShDegree::new(2).expect("degrees 0 to 3 exist"),
-            iterations_per_keyframe: 3,
+            iterations_per_keyframe: 5,
             first_iterations: 50,
             yields_to_keyframes: false,
             seed: 0,
@@ -258,7 +258,7 @@ impl Default for RefineConfig {
     fn default() -> Self {
         Self {
             steps_per_keyframe: 8,
-            final_epochs: 18,
+            final_epochs: 17,
             steps: 0,
             seconds: None,
             all_tiles: true,
