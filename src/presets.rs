@@ -21,9 +21,9 @@ pub enum Preset {
     Draft,
     /// The defaults.
     Balanced,
-    /// More epochs at the end, and denser insertion.
+    /// More steps over all keyframes, and denser insertion.
     Quality,
-    /// The same with 150 epochs at the end.
+    /// The same with more steps.
     Best,
 }
 
@@ -65,16 +65,16 @@ impl Preset {
                 mapping.refine.final_epochs = 6;
             }
             Self::Balanced => {}
-            Self::Quality => refined(config, 60),
-            Self::Best => refined(config, 150),
+            Self::Quality => refined(config, 20, 48),
+            Self::Best => refined(config, 30, 135),
         }
     }
 }
 
-/// Denser insertion, less pruning, and so many epochs at the end.
-fn refined(config: &mut Config, final_epochs: usize) {
+/// Denser insertion, less pruning, and more steps over all keyframes: so many after each keyframe, and epochs at the end.
+fn refined(config: &mut Config, steps_per_keyframe: usize, final_epochs: usize) {
     let mapping = &mut config.mapping;
-    mapping.refine.final_epochs = final_epochs;
+    (mapping.refine.steps_per_keyframe, mapping.refine.final_epochs) = (steps_per_keyframe, final_epochs);
     mapping.insertion.detail = 0.04;
     mapping.density.multi_view.min_contribution = 0.5;
 }

@@ -258,7 +258,7 @@ impl Default for RefineConfig {
     fn default() -> Self {
         Self {
             steps_per_keyframe: 8,
-            final_epochs: 17,
+            final_epochs: 15,
             steps: 0,
             seconds: None,
             all_tiles: true,

@@ -12,6 +12,9 @@ use crate::optimise::{AdamConfig, StepReport};
 
 use super::{BATCH, Mapper, Step};
 
+/// Share of the steps after which nothing is pruned: neighbours take some epochs to fill the place of a Gaussian.
+const LAST_CONTROL: f32 = 0.8;
+
 /// Where a refinement stands; begun by [`Mapper::begin_refinement`].
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct FinalRefinement {
@@ -144,7 +147,8 @@ impl Mapper {
             refinement.done += batch.len();
         }
         self.refine_exposures(refinement)?;
-        let (pruned, grown) = if !refinement.is_done() { self.score_and_control(refinement, &density, &adam)? } else { (0, 0) };
+        let is_controlled = refinement.progress() < LAST_CONTROL;
+        let (pruned, grown) = if is_controlled { self.score_and_control(refinement, &density, &adam)? } else { (0, 0) };
         let psnr_db = psnr.0 / psnr.1.max(1) as f32;
         Ok(Some(RefineReport { steps_done: refinement.done, pruned, grown, gaussians: self.cloud.len(), psnr_db }))
     }
