@@ -1,7 +1,7 @@
 //! Consolidation: steps over all keyframes. Each epoch draws every keyframe once, in a seeded shuffle.
 //!
-//! Online, some steps of the running epoch follow each keyframe, at constant rates. The final refinement follows the last keyframe: steps at half size first, then at full
-//! size, with density control in between; rates fall exponentially, as 3DGS has it for positions.
+//! Online, some steps of the running epoch follow each keyframe, at constant rates. The final refinement follows the last keyframe: steps at
+//! half size first, then at full size, with density control in between; rates fall exponentially, as 3DGS has it for positions.
 
 use std::time::Instant;
 
