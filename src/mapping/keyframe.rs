@@ -83,8 +83,6 @@ pub(super) struct MappedKeyframe {
     scale_since_anchor: f64,
     /// Exposure of the recorded image against the map.
     pub exposure: Exposure,
-    /// Median of the measured depths, metres; 1 if there are none.
-    pub depth_metres: f64,
     image: Images,
     /// On the host, where depth is swept for.
     gray: Option<GrayImage>,
@@ -102,7 +100,6 @@ pub(super) struct KeyframeState {
     anchored_from_world: Se3,
     scale_since_anchor: f64,
     exposure: Exposure,
-    depth_metres: f64,
     covisible: Vec<KeyframeId>,
     loss: f32,
     tile_losses: TileLosses,
@@ -127,7 +124,6 @@ impl MappedKeyframe {
             anchored_from_world: camera.camera_from_world,
             scale_since_anchor: 1.0,
             exposure,
-            depth_metres: image.median_depth_metres().unwrap_or(1.0),
             image: Images::new(gpu, image, with_half)?,
             gray: matches!(keyframe.depth_source, DepthSource::Landmarks { .. }).then(|| plane_sweep::gray(&image.color)),
             covisible: keyframe.covisible.clone(),
@@ -143,7 +139,6 @@ impl MappedKeyframe {
             anchored_from_world: self.anchored_from_world,
             scale_since_anchor: self.scale_since_anchor,
             exposure: self.exposure,
-            depth_metres: self.depth_metres,
             covisible: self.covisible.clone(),
             loss: self.loss,
             tile_losses: self.image.tile_losses(gpu)?,
@@ -179,7 +174,6 @@ impl MappedKeyframe {
             anchored_from_world: state.anchored_from_world,
             scale_since_anchor: state.scale_since_anchor,
             exposure: state.exposure,
-            depth_metres: state.depth_metres,
             gray: state.swept.as_ref().map(|_| plane_sweep::gray(&image.color)),
             image: images,
             covisible: state.covisible.clone(),
@@ -203,7 +197,6 @@ impl MappedKeyframe {
             (self.anchored_from_world, self.scale_since_anchor) = (camera_from_world, 1.0);
             if scale != 1.0 && self.depth_is_estimated() {
                 self.image.scale_depth(gpu, store, scale)?;
-                self.depth_metres *= scale;
             }
         }
         Ok(motion)

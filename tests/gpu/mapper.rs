@@ -226,6 +226,26 @@ fn exposures_of_photos_are_measured_in_the_refinement() {
     assert!((0.3..0.7).contains(&apart) && (0..6).all(|k| (gains[k] > 0.0) == k.is_multiple_of(2)), "{gains:?}");
 }
 
+/// Few Gaussians are opaque enough here: a round of control removes most, and none comes in the last fifth.
+#[test]
+fn nothing_is_pruned_at_the_end() {
+    let Some(gpu) = adapter() else { return };
+    let mut config = MappingConfig { first_iterations: 5, iterations_per_keyframe: 5, ..Default::default() };
+    (config.density.every, config.density.min_opacity, config.refine.final_epochs) = (1000, 0.95, 3);
+    for (density_every, is_pruned) in [(9, true), (15, false)] {
+        config.refine.density_every = density_every;
+        let mut mapper = Mapper::new(gpu.clone(), &config).unwrap();
+        (0..6).for_each(|id| assert!(mapper.insert(&keyframe(id, true), &|| false).unwrap().gaussians > 0));
+        let mut refinement = mapper.begin_refinement().unwrap();
+        let rounds: Vec<_> = std::iter::from_fn(|| mapper.refine(&mut refinement, &|| false).unwrap()).collect();
+        assert_eq!(
+            rounds.iter().any(|round| round.pruned > 0),
+            is_pruned,
+            "control every {density_every} of 18 steps: {rounds:?}"
+        );
+    }
+}
+
 #[test]
 fn the_final_epochs_draw_each_keyframe_as_often() {
     let Some(gpu) = adapter() else { return };

@@ -86,7 +86,7 @@ impl Mapper {
     fn draw(&mut self, count: usize, coarse: bool) -> Vec<Step> {
         let mut next = || {
             if self.epoch.is_empty() {
-                self.epoch = (0..self.keyframes.len()).collect();
+                self.epoch = self.views();
                 self.rng.shuffle(&mut self.epoch);
             }
             self.epoch.pop()
@@ -104,7 +104,7 @@ impl Mapper {
         self.steps(batch, None, sampling, adam)
     }
 
-    /// Begins a refinement over the keyframes so far; none may come until it is done.
+    /// Begins a refinement, and with it an epoch, over the keyframes so far; none may come until it is done.
     ///
     /// # Errors
     /// [`MappingError`] if a buffer does not fit or the device fails.
@@ -112,7 +112,7 @@ impl Mapper {
         let mut config = self.config.refine.clone();
         config.steps = match config.seconds {
             Some(_) => usize::MAX,
-            None => config.steps.max(config.final_epochs * self.views().len()),
+            None => config.steps.max(config.final_epochs * self.keyframes.len()),
         };
         let started = config.seconds.map(|_| Instant::now());
         self.epoch.clear();

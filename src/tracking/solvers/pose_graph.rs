@@ -43,20 +43,20 @@ pub struct PoseGraph {
 }
 
 /// An edge's whitened residual and its derivatives by the poses of a and b.
-pub struct Linearised {
-    pub residual: Vector7,
-    pub by_a: Matrix7,
-    pub by_b: Matrix7,
+struct Linearised {
+    residual: Vector7,
+    by_a: Matrix7,
+    by_b: Matrix7,
 }
 
 impl Edge {
     /// `Log(measured a_from_b · b_from_a)`, whitened; 0 where the poses agree with the edge.
-    pub fn residual(&self, a_from_world: &Sim3, b_from_world: &Sim3) -> Vector7 {
+    fn residual(&self, a_from_world: &Sim3, b_from_world: &Sim3) -> Vector7 {
         sim3::log(&(self.a_from_b * *b_from_world * a_from_world.inverse())).component_mul(&self.weights)
     }
 
     /// For left perturbations: `b` moves the argument of the logarithm from within, `a` from its right end.
-    pub fn linearise(&self, a_from_world: &Sim3, b_from_world: &Sim3) -> Linearised {
+    fn linearise(&self, a_from_world: &Sim3, b_from_world: &Sim3) -> Linearised {
         let error = self.a_from_b * *b_from_world * a_from_world.inverse();
         let tau = sim3::log(&error);
         let whitened = Matrix7::from_diagonal(&self.weights) * sim3::left_jacobian_inverse(&tau);
@@ -68,7 +68,7 @@ impl Edge {
     }
 
     /// Cost of a squared residual, and the weight that it gives the residual.
-    pub fn robust(&self, squared: f64) -> (f64, f64) {
+    fn robust(&self, squared: f64) -> (f64, f64) {
         self.huber.map_or((squared, 1.0), |sigmas| huber(squared, sigmas * sigmas))
     }
 }
