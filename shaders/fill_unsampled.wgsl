@@ -10,12 +10,8 @@
 const THREADS: u32 = 32u;
 
 @compute @workgroup_size(THREADS)
-fn main(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) local: u32,
-) {
-    let tile = linear_workgroup(workgroup, workgroups);
+fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_index) local: u32) {
+    let tile = linear_workgroup(workgroup);
     if tile >= view.tiles_x * view.tiles_y || !is_bit_set(unsampled.bits[tile / 128u % 1024u], tile) {
         return;
     }

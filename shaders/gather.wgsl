@@ -12,12 +12,8 @@ struct GatherSetup {
 @group(0) @binding(3) var<storage, read_write> planes_out: array<vec4<f32>>;
 
 @compute @workgroup_size(256)
-fn main(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) local: u32,
-) {
-    let i = linear_workgroup(workgroup, workgroups) * 256u + local;
+fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_index) local: u32) {
+    let i = linear_workgroup(workgroup) * 256u + local;
     if i >= setup.count {
         return;
     }

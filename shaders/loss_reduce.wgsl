@@ -1,7 +1,16 @@
-// Sums the loss terms of all workgroups in a fixed order; one workgroup.
+// Sums the loss terms of all tiles in a fixed order, and writes the log of the step; one workgroup.
+
+// Host twin: `render::layout::StepLog`.
+struct StepLog {
+    // (Σ|colour error|, Σ SSIM, Σ|depth error|, Σ squared colour error).
+    loss: vec4<f32>,
+    counters: array<Counter, 2>,
+}
+
+// [tiles], see `loss_forward`.
 @group(0) @binding(0) var<storage, read> loss_sums: array<vec4<f32>>;
-// (Σ|colour error|, Σ SSIM, Σ|depth error|, Σ squared colour error).
-@group(0) @binding(1) var<storage, read_write> total: array<vec4<f32>>;
+@group(0) @binding(1) var<storage, read> counters: array<Counter>;
+@group(0) @binding(2) var<storage, read_write> log_: StepLog;
 
 var<workgroup> sums: array<vec4<f32>, 256>;
 
@@ -19,6 +28,9 @@ fn main(@builtin(local_invocation_index) local: u32) {
         }
     }
     if local == 0u {
-        total[0] = sums[0];
+        log_.loss = sums[0];
+    }
+    if local < 2u {
+        log_.counters[local] = counters[local];
     }
 }

@@ -11,12 +11,8 @@
 @group(0) @binding(3) var<storage, read> intersection_gradients: array<vec4<f32>>;
 
 @compute @workgroup_size(256)
-fn main(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) local: u32,
-) {
-    let item = linear_workgroup(workgroup, workgroups) * 256u + local;
+fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_index) local: u32) {
+    let item = linear_workgroup(workgroup) * 256u + local;
     // Without room for all intersections nothing was rendered: the step will be repeated.
     if item < counters[VISIBLE_COUNTER].count && counters[INTERSECTION_COUNTER].count > 0u {
         backward(intersection_counts[3u * view.capacity + item]);

@@ -10,16 +10,25 @@
 // [N] 1 where the Gaussian may touch the image.
 @group(0) @binding(3) var<storage, read_write> visible: array<u32>;
 @group(0) @binding(4) var<uniform> unsampled: UnsampledTiles;
+// [N / 256] visible Gaussians of each workgroup.
+@group(0) @binding(5) var<storage, read_write> block_sums: array<u32>;
+
+var<workgroup> visible_here: atomic<u32>;
 
 @compute @workgroup_size(256)
-fn main(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) local: u32,
-) {
-    let i = linear_workgroup(workgroup, workgroups) * 256u + local;
+fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_index) local: u32) {
+    let block = linear_workgroup(workgroup);
+    let i = block * 256u + local;
     if i < view.gaussian_count {
-        visible[i] = select(0u, 1u, project(i));
+        let is_visible = project(i);
+        visible[i] = select(0u, 1u, is_visible);
+        if is_visible {
+            atomicAdd(&visible_here, 1u);
+        }
+    }
+    workgroupBarrier();
+    if local == 0u && i < view.gaussian_count {
+        block_sums[block] = atomicLoad(&visible_here);
     }
 }
 

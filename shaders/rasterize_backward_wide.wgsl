@@ -8,12 +8,8 @@
 var<workgroup> strips: array<PixelState, TILE_THREADS>;
 
 @compute @workgroup_size(THREADS)
-fn main(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) local: u32,
-) {
-    let place = place_of(linear_workgroup(workgroup, workgroups), local);
+fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_index) local: u32) {
+    let place = place_of(linear_workgroup(workgroup), local);
     strips[local] = load_pixels(place, 0u);
     workgroupBarrier();
     let count = workgroupUniformLoad(&longest);

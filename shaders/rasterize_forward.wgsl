@@ -22,12 +22,8 @@ struct Blended {
 }
 
 @compute @workgroup_size(THREADS)
-fn main(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) local: u32,
-) {
-    let place = place_of(linear_workgroup(workgroup, workgroups), local);
+fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_index) local: u32) {
+    let place = place_of(linear_workgroup(workgroup), local);
     let block = place.block;
     let count = place.range.y - place.range.x;
     atomicMax(&longest, count);

@@ -29,12 +29,8 @@ const CHUNK: u32 = 8u;
 var<workgroup> partial: array<vec4<f32>, CHUNK * 2u * THREADS>;
 
 @compute @workgroup_size(THREADS)
-fn main(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) local: u32,
-) {
-    let place = place_of(linear_workgroup(workgroup, workgroups), local);
+fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_index) local: u32) {
+    let place = place_of(linear_workgroup(workgroup), local);
     let block = place.block;
     let threshold = max(setup.noise, setup.error_ratio * total.x / (3.0 * setup.pixels));
     var pixels: array<PixelState, STRIPS>;

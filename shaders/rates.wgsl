@@ -8,24 +8,16 @@
 const ROUNDS: u32 = 256u;
 
 @compute @workgroup_size(256)
-fn copy_memory(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) local: u32,
-) {
-    let i = linear_workgroup(workgroup, workgroups) * 256u + local;
+fn copy_memory(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_index) local: u32) {
+    let i = linear_workgroup(workgroup) * 256u + local;
     if i < arrayLength(&source) {
         sink[i] = source[i];
     }
 }
 
 @compute @workgroup_size(256)
-fn multiply_add(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) local: u32,
-) {
-    let i = linear_workgroup(workgroup, workgroups) * 256u + local;
+fn multiply_add(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_index) local: u32) {
+    let i = linear_workgroup(workgroup) * 256u + local;
     let factor = source[0];
     let addend = source[1];
     // Eight independent chains hide the latency of each.

@@ -50,12 +50,8 @@ fn exclusive_sum(local: u32, value: u32) -> u32 {
 }
 
 @compute @workgroup_size(256)
-fn count_digits(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) local: u32,
-) {
-    let block = linear_workgroup(workgroup, workgroups);
+fn count_digits(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_index) local: u32) {
+    let block = linear_workgroup(workgroup);
     let count = counters[setup.counter].count;
     for (var k = local; k < SORT_BLOCK; k += 256u) {
         let i = block * SORT_BLOCK + k;
@@ -72,12 +68,8 @@ fn count_digits(
 // A workgroup takes SORT_CHUNK blocks, and invocation d turns their counts of digit d into positions among the chunk's keys of that
 // digit; what they come to goes behind all blocks.
 @compute @workgroup_size(256)
-fn scan_digits(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) local: u32,
-) {
-    let chunk = linear_workgroup(workgroup, workgroups);
+fn scan_digits(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_index) local: u32) {
+    let chunk = linear_workgroup(workgroup);
     let blocks = block_count(counters[setup.counter].count);
     var running = 0u;
     for (var block = chunk * SORT_CHUNK; block < min((chunk + 1u) * SORT_CHUNK, blocks); block++) {
@@ -91,12 +83,8 @@ fn scan_digits(
 }
 
 @compute @workgroup_size(64)
-fn scatter(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) local: u32,
-) {
-    let block = linear_workgroup(workgroup, workgroups);
+fn scatter(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_index) local: u32) {
+    let block = linear_workgroup(workgroup);
     let count = counters[setup.counter].count;
     if block * SORT_BLOCK >= count {
         return;

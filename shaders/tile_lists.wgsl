@@ -16,8 +16,8 @@ struct TileListsSetup {
 // [visible] tiles of each Gaussian, nearest first (mode 0); behind them, from `capacity` on, its first slot and that past its last, in map
 // order (mode 1); and from three times that on, which Gaussians are visible, in map order (`compact_visible`).
 @group(0) @binding(5) var<storage, read_write> intersection_counts: array<u32>;
-// [visible] where each Gaussian's slots begin, nearest first.
-@group(0) @binding(6) var<storage, read> intersection_offsets: array<u32>;
+// [visible / 256] intersections of each workgroup's Gaussians (mode 0), of those before it (mode 1).
+@group(0) @binding(6) var<storage, read_write> block_sums: array<u32>;
 // [intersections] tile, and the intersection's slot, before the tile sort.
 @group(0) @binding(7) var<storage, read_write> tile_keys: array<u32>;
 @group(0) @binding(8) var<storage, read_write> slots: array<u32>;
@@ -28,16 +28,34 @@ struct TileListsSetup {
 // Slack for rounding, absolute and relative: a tile too many costs time, one too few a seam.
 const SLACK: f32 = 1e-3;
 
+var<workgroup> found_here: atomic<u32>;
+
 @compute @workgroup_size(256)
-fn main(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) local: u32,
-) {
-    let rank = linear_workgroup(workgroup, workgroups) * 256u + local;
-    if rank >= counters[VISIBLE_COUNTER].count {
-        return;
+fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_index) local: u32) {
+    let block = linear_workgroup(workgroup);
+    let rank = block * 256u + local;
+    let is_there = rank < counters[VISIBLE_COUNTER].count;
+    if setup.emit == 0u {
+        if is_there {
+            let found = list(rank, false, 0u);
+            intersection_counts[rank] = found;
+            atomicAdd(&found_here, found);
+        }
+        workgroupBarrier();
+        if is_there && local == 0u {
+            block_sums[block] = atomicLoad(&found_here);
+        }
+    } else {
+        let found = select(0u, intersection_counts[rank], is_there);
+        let slot = block_sums[block] + exclusive_sum(local, found);
+        if is_there && counters[INTERSECTION_COUNTER].count > 0u {
+            list(rank, true, slot);
+        }
     }
+}
+
+// Counts the tiles of a Gaussian, or emits them from `slot` on; returns their number.
+fn list(rank: u32, emit: bool, slot: u32) -> u32 {
     let gaussian = order[rank];
     let mean_cut = projected[3u * gaussian];
     let conic_factor = projected[3u * gaussian + 1u].xyz;
@@ -50,11 +68,6 @@ fn main(
     let low = vec2<u32>(clamp(floor((mean - half_extent) / tile_size), vec2(0.0), last_tile));
     let high = vec2<u32>(clamp(floor((mean + half_extent) / tile_size), vec2(0.0), last_tile));
     var found = 0u;
-    var slot = 0u;
-    let emit = setup.emit == 1u && counters[INTERSECTION_COUNTER].count > 0u;
-    if emit {
-        slot = intersection_offsets[rank];
-    }
     for (var y = low.y; y <= high.y; y++) {
         for (var x = low.x; x <= high.x; x++) {
             let tile = y * view.tiles_x + x;
@@ -72,12 +85,11 @@ fn main(
             found++;
         }
     }
-    if setup.emit == 0u {
-        intersection_counts[rank] = found;
-    } else {
+    if emit {
         intersection_counts[view.capacity + 2u * gaussian] = slot;
         intersection_counts[view.capacity + 2u * gaussian + 1u] = slot + found;
     }
+    return found;
 }
 
 // Whether ½dᵀΣ⁻¹d ≤ limit somewhere on the rectangle [first, first + span], d measured from the mean. The form is convex: its minimum

@@ -137,13 +137,12 @@ pub enum ConfigError {
 }
 
 /// Dotted keys of earlier versions, and those that replaced them; keys of a section before the section itself.
-const RENAMED: [(&str, &str); 25] = [
+const RENAMED: [(&str, &str); 20] = [
     ("mapping.limits.max_keyframes", "mapping.limits.max_gpu_images"),
     ("mapping.density.vcd.min_worth", "mapping.density.multi_view.min_contribution"),
     ("mapping.density.vcd.wrong_pixels", "mapping.density.multi_view.error_pixels"),
     ("mapping.density.multi_view.min_worth", "mapping.density.multi_view.min_contribution"),
     ("mapping.density.vcd", "mapping.density.multi_view"),
-    ("mapping.window.last_pace", "mapping.window.final_lr_scale"),
     ("mapping.adam.position_rate", "mapping.adam.lr_position"),
     ("mapping.adam.opacity_rate", "mapping.adam.lr_opacity"),
     ("mapping.adam.scale_rate", "mapping.adam.lr_log_scale"),
@@ -157,12 +156,8 @@ const RENAMED: [(&str, &str); 25] = [
     ("mapping.skip.tile_share", "mapping.tile_sampling.share"),
     ("mapping.skip.tile_least", "mapping.tile_sampling.min_share"),
     ("mapping.skip.tile_noise", "mapping.tile_sampling.noise"),
-    ("mapping.skip.draw_by_loss", "mapping.schedule.draw_by_loss"),
-    ("mapping.skip.coarse_share", "mapping.schedule.coarse_share"),
-    ("mapping.skip.min_gain", "mapping.schedule.min_gain"),
     ("replay.paced", "replay.real_time"),
     ("mapping.seeding", "mapping.insertion"),
-    ("mapping.skip", "mapping.schedule"),
 ];
 
 /// Refuses keys of earlier versions by their new names.

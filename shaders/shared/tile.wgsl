@@ -3,7 +3,7 @@
 // through workgroup memory.
 
 @group(0) @binding(0) var<uniform> view: View;
-// [tiles] (first intersection, past the last) in the sorted list, then [tiles] (tile, 0) in the order of `order_tiles`; [intersections] slot of each sorted intersection; [intersections] Gaussian of each slot.
+// [tiles] (first intersection, past the last) in the sorted list, then, in the narrow form, [tiles] (tile, 0) in the order of `order_tiles`; [intersections] slot of each sorted intersection; [intersections] Gaussian of each slot.
 @group(0) @binding(1) var<storage, read> ranges: array<vec2<u32>>;
 @group(0) @binding(2) var<storage, read> sorted_slots: array<u32>;
 @group(0) @binding(3) var<storage, read> slot_gaussians: array<u32>;
@@ -44,11 +44,14 @@ fn place_of(group: u32, local: u32) -> Place {
     let member = local / TILE_THREADS;
     let thread = local % TILE_THREADS;
     let tiles = view.tiles_x * view.tiles_y;
-    // Successive workgroups go to one thread of a software adapter: each stretch of them takes from the whole list, whose end has nothing to do.
-    let part = (tiles + GROUP_TILES * LIST_PARTS - 1u) / (GROUP_TILES * LIST_PARTS);
-    let turn = (group % LIST_PARTS * part + group / LIST_PARTS) * GROUP_TILES + member;
-    let is_there = turn < tiles && group / LIST_PARTS < part;
-    let tile = select(tiles, ranges[tiles + min(turn, tiles - 1u)].x, is_there);
+    var tile = min(group, tiles);
+    if GROUP_TILES > 1u {
+        // Successive workgroups go to one thread of a software adapter: each stretch of them takes from the whole list, whose end has nothing to do.
+        let part = (tiles + GROUP_TILES * LIST_PARTS - 1u) / (GROUP_TILES * LIST_PARTS);
+        let turn = (group % LIST_PARTS * part + group / LIST_PARTS) * GROUP_TILES + member;
+        let is_there = turn < tiles && group / LIST_PARTS < part;
+        tile = select(tiles, ranges[tiles + min(turn, tiles - 1u)].x, is_there);
+    }
     let range = select(vec2(0u), ranges[min(tile, tiles - 1u)], tile < tiles);
     return Place(tile, member, thread, range, block_of(tile, thread));
 }

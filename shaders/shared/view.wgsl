@@ -24,9 +24,9 @@ struct View {
     intersection_capacity: u32,
 }
 
-// Workgroups beyond 65,535 are laid out in two dimensions.
-fn linear_workgroup(workgroup: vec3<u32>, workgroups: vec3<u32>) -> u32 {
-    return workgroup.y * workgroups.x + workgroup.x;
+// Workgroups beyond 65,535 are laid out in further rows of as many.
+fn linear_workgroup(workgroup: vec3<u32>) -> u32 {
+    return workgroup.y * 65535u + workgroup.x;
 }
 
 fn rotate_to_camera(view_: View, v: vec3<f32>) -> vec3<f32> {

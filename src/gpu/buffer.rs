@@ -1,4 +1,4 @@
-//! Buffers that count themselves, refuse impossible sizes, and read back.
+//! Buffers that count themselves and refuse impossible sizes.
 
 use std::sync::Arc;
 
@@ -6,13 +6,18 @@ use bytemuck::Pod;
 use wgpu::BufferUsages;
 
 use super::device::MemoryCount;
+use super::readback::Part;
 use super::{Gpu, GpuError};
 
-/// A GPU buffer with its place in the memory count.
+/// A GPU buffer with its place in the memory count, or a window on one.
 #[derive(Debug)]
 pub struct GpuBuffer {
     raw: wgpu::Buffer,
-    memory: Arc<MemoryCount>,
+    /// Of a window: bytes from the start of the buffer.
+    offset: u64,
+    size: u64,
+    /// Nothing for a window: the whole buffer is counted and destroyed.
+    memory: Option<Arc<MemoryCount>>,
     /// Tells this buffer from every other; gone when it is.
     identity: Arc<()>,
 }
@@ -55,23 +60,47 @@ impl GpuBuffer {
         }
         let raw = allocate(gpu, label, size, usage)?;
         gpu.memory.add(size);
-        Ok(Self { raw, memory: gpu.memory.clone(), identity: Arc::default() })
+        Ok(Self { raw, offset: 0, size, memory: Some(gpu.memory.clone()), identity: Arc::default() })
+    }
+
+    /// A part of the buffer, to bind by itself; of no use once the buffer is gone.
+    pub(crate) fn window(&self, offset: u64, size: u64) -> Self {
+        assert!(offset + size <= self.size, "a window lies within its buffer");
+        Self { raw: self.raw.clone(), offset: self.offset + offset, size, memory: None, identity: Arc::default() }
     }
 
     pub(super) fn identity(&self) -> &Arc<()> {
         &self.identity
     }
 
-    /// The wgpu buffer.
+    /// The wgpu buffer; of a window, the whole one.
     pub fn raw(&self) -> &wgpu::Buffer {
         &self.raw
+    }
+
+    /// Length, bytes.
+    pub fn size(&self) -> u64 {
+        self.size
+    }
+
+    pub(super) fn binding(&self) -> wgpu::BindingResource<'_> {
+        let size = std::num::NonZeroU64::new(self.size);
+        wgpu::BindingResource::Buffer(wgpu::BufferBinding { buffer: &self.raw, offset: self.offset, size })
     }
 
     /// Writes `values` from element `first` (of their own size) on; it takes effect before the next submission.
     pub fn write<T: Pod>(&self, gpu: &Gpu, first: usize, values: &[T]) {
         if !values.is_empty() {
-            gpu.queue.write_buffer(&self.raw, (first * std::mem::size_of::<T>()) as u64, bytemuck::cast_slice(values));
+            let at = self.offset + (first * std::mem::size_of::<T>()) as u64;
+            gpu.queue.write_buffer(&self.raw, at, bytemuck::cast_slice(values));
+            gpu.traffic.uploaded();
         }
+    }
+
+    /// Elements `first` to before `first + count`, to be read with others by [`Gpu::read`].
+    pub fn part<T: Pod>(&self, first: usize, count: usize) -> Part<'_> {
+        let element = std::mem::size_of::<T>() as u64;
+        Part { buffer: &self.raw, offset: self.offset + first as u64 * element, bytes: count as u64 * element }
     }
 
     /// Waits for all work and reads `count` elements from element `first` on.
@@ -79,20 +108,7 @@ impl GpuBuffer {
     /// # Errors
     /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn read<T: Pod>(&self, gpu: &Gpu, first: usize, count: usize) -> Result<Vec<T>, GpuError> {
-        let element = std::mem::size_of::<T>();
-        let bytes = (count * element) as u64;
-        if bytes == 0 {
-            return Ok(Vec::new());
-        }
-        let staging = allocate(gpu, "readback", bytes, BufferUsages::MAP_READ | BufferUsages::COPY_DST)?;
-        let mut encoder = gpu.device.create_command_encoder(&Default::default());
-        encoder.copy_buffer_to_buffer(&self.raw, (first * element) as u64, &staging, 0, bytes);
-        gpu.queue.submit([encoder.finish()]);
-        staging.map_async(wgpu::MapMode::Read, .., |_| {});
-        gpu.wait()?;
-        let view = staging.get_mapped_range(..).map_err(|e| GpuError::Failed(e.to_string()))?;
-        // The mapping has no alignment that a cast could rely on.
-        Ok(view.chunks_exact(element).map(bytemuck::pod_read_unaligned).collect())
+        Ok(gpu.read(None, &[self.part::<T>(first, count)])?.part(0))
     }
 }
 
@@ -107,7 +123,7 @@ impl Gpu {
 }
 
 /// A wgpu buffer. An adapter without the memory for it refuses at once, and goes on working.
-fn allocate(gpu: &Gpu, label: &str, size: u64, usage: BufferUsages) -> Result<wgpu::Buffer, GpuError> {
+pub(super) fn allocate(gpu: &Gpu, label: &str, size: u64, usage: BufferUsages) -> Result<wgpu::Buffer, GpuError> {
     if gpu.memory.is_beyond(size) {
         return Err(GpuError::OutOfMemory(label.into()));
     }
@@ -120,8 +136,10 @@ fn allocate(gpu: &Gpu, label: &str, size: u64, usage: BufferUsages) -> Result<wg
 
 impl Drop for GpuBuffer {
     fn drop(&mut self) {
-        self.memory.remove(self.raw.size());
-        // Not when the last bind group over it goes: kernels keep theirs until they need another.
-        self.raw.destroy();
+        if let Some(memory) = &self.memory {
+            memory.remove(self.size);
+            // Not when the last bind group over it goes: kernels keep theirs until they need another.
+            self.raw.destroy();
+        }
     }
 }

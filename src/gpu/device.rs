@@ -7,7 +7,9 @@ use std::time::Duration;
 use serde::Serialize;
 use wgpu::{Backends, InstanceDescriptor, InstanceFlags};
 
+use super::GpuBuffer;
 use super::profile::Profiler;
+use super::traffic::{Traffic, TrafficCount};
 
 /// Failure of the adapter, the device or an allocation on it.
 #[derive(Debug, thiserror::Error)]
@@ -120,6 +122,9 @@ pub struct Gpu {
     pub adapter: AdapterSummary,
     failure: Arc<Mutex<Option<Failure>>>,
     pub(super) memory: Arc<MemoryCount>,
+    pub(super) traffic: Traffic,
+    /// For the next readback.
+    staging: Mutex<Option<wgpu::Buffer>>,
     pub(super) profiler: Option<Profiler>,
 }
 
@@ -275,7 +280,16 @@ impl Gpu {
         let failure = Arc::new(Mutex::new(None));
         watch(&device, &failure);
         let profiler = profiled.then(|| Profiler::new(&device));
-        Arc::new(Self { device, queue, adapter: adapter.get_info().into(), failure, memory: Arc::default(), profiler })
+        Arc::new(Self {
+            device,
+            queue,
+            adapter: adapter.get_info().into(),
+            failure,
+            memory: Arc::default(),
+            traffic: Traffic::default(),
+            staging: Mutex::default(),
+            profiler,
+        })
     }
 
     /// The largest storage buffer, bytes.
@@ -302,6 +316,37 @@ impl Gpu {
         }
     }
 
+    /// Submits the commands of `encoder`.
+    pub fn submit(&self, encoder: wgpu::CommandEncoder) {
+        self.queue.submit([encoder.finish()]);
+        self.traffic.submitted();
+    }
+
+    /// What has passed between host and adapter so far.
+    pub fn traffic(&self) -> TrafficCount {
+        self.traffic.count()
+    }
+
+    pub(super) fn take_staging(&self) -> Option<wgpu::Buffer> {
+        self.staging.lock().unwrap_or_else(PoisonError::into_inner).take()
+    }
+
+    pub(super) fn keep_staging(&self, staging: wgpu::Buffer) {
+        *self.staging.lock().unwrap_or_else(PoisonError::into_inner) = Some(staging);
+    }
+
+    /// Copies all of one buffer to the beginning of another.
+    pub fn copy(&self, encoder: &mut wgpu::CommandEncoder, from: &GpuBuffer, to: &GpuBuffer) {
+        encoder.copy_buffer_to_buffer(from.raw(), 0, to.raw(), 0, from.size());
+        self.traffic.copied();
+    }
+
+    /// Fills a buffer with zeros.
+    pub fn clear(&self, encoder: &mut wgpu::CommandEncoder, buffer: &GpuBuffer) {
+        encoder.clear_buffer(buffer.raw(), 0, None);
+        self.traffic.copied();
+    }
+
     /// Waits until everything submitted is done, for ten minutes at most.
     ///
     /// # Errors
@@ -316,6 +361,7 @@ impl Gpu {
     /// [`GpuError`] if the device failed; [`GpuError::Hung`] if it exceeds `limit`.
     pub fn wait_at_most(&self, limit: Duration) -> Result<(), GpuError> {
         self.check()?;
+        self.traffic.waited();
         match self.device.poll(wgpu::PollType::Wait { submission_index: None, timeout: Some(limit) }) {
             Ok(_) => {}
             Err(wgpu::PollError::Timeout) => note(&self.failure, Failure::Hung(limit)),

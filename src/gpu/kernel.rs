@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex, PoisonError, Weak};
 use super::{Gpu, GpuBuffer};
 
 /// Bind groups that a kernel keeps for the next dispatch over the same buffers.
-const KEPT: usize = 32;
+const KEPT: usize = 64;
 
 /// A compiled entry point.
 #[derive(Debug)]
@@ -87,7 +87,7 @@ impl Kernel {
         }
         let entries: Vec<wgpu::BindGroupEntry> = bindings
             .iter()
-            .map(|(binding, buffer)| wgpu::BindGroupEntry { binding: *binding, resource: buffer.raw().as_entire_binding() })
+            .map(|(binding, buffer)| wgpu::BindGroupEntry { binding: *binding, resource: buffer.binding() })
             .collect();
         let descriptor = wgpu::BindGroupDescriptor { label: Some(self.label), layout: &self.layout, entries: &entries };
         let group = gpu.device.create_bind_group(&descriptor);
@@ -101,6 +101,7 @@ impl Kernel {
         pass.set_pipeline(&self.pipeline);
         pass.set_bind_group(0, &self.bind(gpu, bindings), &[]);
         gpu.mark(pass, self.label);
+        gpu.traffic.dispatched();
         pass.dispatch_workgroups(size[0], size[1], size[2]);
     }
 
@@ -115,6 +116,7 @@ impl Kernel {
         pass.set_pipeline(&self.pipeline);
         pass.set_bind_group(0, &self.bind(gpu, bindings), &[]);
         gpu.mark(pass, self.label);
+        gpu.traffic.dispatched();
         pass.dispatch_workgroups_indirect(size.buffer.raw(), size.offset);
     }
 }

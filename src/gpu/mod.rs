@@ -5,7 +5,13 @@ mod device;
 mod kernel;
 pub mod plain;
 mod profile;
+mod readback;
+mod traffic;
+mod uniforms;
 
 pub use buffer::GpuBuffer;
 pub use device::{AdapterSummary, Gpu, GpuError, adapters};
 pub use kernel::{IndirectSize, Kernel, workgroups};
+pub use readback::{Part, ReadBack};
+pub use traffic::TrafficCount;
+pub use uniforms::{UniformCell, Uniforms};

@@ -23,8 +23,6 @@ pub struct MappingConfig {
     pub seed: u64,
     /// Keyframes that a step may draw.
     pub window: WindowConfig,
-    /// Views, sizes and number of the steps after a keyframe.
-    pub schedule: ScheduleConfig,
     /// Tiles of a view that a step uses.
     pub tile_sampling: TileSamplingConfig,
     /// Bounds on Gaussians, memory and keyframes.
@@ -56,7 +54,6 @@ impl Default for MappingConfig {
             yields_to_keyframes: false,
             seed: 0,
             window: WindowConfig::default(),
-            schedule: ScheduleConfig::default(),
             tile_sampling: TileSamplingConfig::default(),
             limits: LimitsConfig::default(),
             exposure: ExposureConfig::default(),
@@ -81,32 +78,11 @@ pub struct WindowConfig {
     pub covisible: usize,
     /// Share of steps that go to any older keyframe, so that the map does not forget.
     pub older_share: f32,
-    /// After each keyframe Adam's step sizes fall evenly to this share of themselves: new Gaussians move fast, and the map has settled
-    /// when the next keyframe comes.
-    pub final_lr_scale: f32,
 }
 
 impl Default for WindowConfig {
     fn default() -> Self {
-        Self { recent: 6, covisible: 3, older_share: 0.6, final_lr_scale: 1.0 }
-    }
-}
-
-/// Which steps follow a keyframe: their views, sizes and number.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct ScheduleConfig {
-    /// Older keyframes are drawn in proportion to their loss, not uniformly.
-    pub draw_by_loss: bool,
-    /// Share of the steps after a keyframe, the first ones, that use images of half the size.
-    pub coarse_share: f32,
-    /// The steps after a keyframe end when ten of them lower the loss of their views by less than this share; 0: never.
-    pub min_gain: f32,
-}
-
-impl Default for ScheduleConfig {
-    fn default() -> Self {
-        Self { draw_by_loss: true, coarse_share: 0.0, min_gain: 0.01 }
+        Self { recent: 6, covisible: 3, older_share: 0.6 }
     }
 }
 
@@ -312,7 +288,7 @@ impl MappingConfig {
     /// Whether any step may be taken at half the size.
     pub fn learns_at_half_size(&self) -> bool {
         let RefineConfig { steps, final_epochs, seconds, half_size_share, .. } = self.refine;
-        self.schedule.coarse_share > 0.0 || ((steps.max(final_epochs) > 0 || seconds.is_some()) && half_size_share > 0.0)
+        (steps.max(final_epochs) > 0 || seconds.is_some()) && half_size_share > 0.0
     }
 
     /// Whether the clock decides on the number of steps. Such a run neither repeats nor resumes.
@@ -333,8 +309,6 @@ impl MappingConfig {
         }
         let shares = [
             ("window.older_share", self.window.older_share),
-            ("schedule.coarse_share", self.schedule.coarse_share),
-            ("schedule.min_gain", self.schedule.min_gain),
             ("insertion.min_alpha", s.min_alpha),
             ("insertion.opacity", s.opacity),
             ("insertion.detail", s.detail),
@@ -364,11 +338,8 @@ impl MappingConfig {
             return Err("mapping.window.recent and mapping.points.size_range must be at least 1".into());
         }
         self.limits.validate().map_err(|e| format!("mapping.limits: {e}"))?;
-        let closed_shares = [
-            ("refine.growth_share", self.refine.growth_share),
-            ("refine.half_size_share", self.refine.half_size_share),
-            ("window.final_lr_scale", self.window.final_lr_scale),
-        ];
+        let closed_shares =
+            [("refine.growth_share", self.refine.growth_share), ("refine.half_size_share", self.refine.half_size_share)];
         if let Some((name, value)) = closed_shares.iter().find(|(_, value)| !(0.0..=1.0).contains(value)) {
             return Err(format!("mapping.{name} must lie between 0 and 1, not {value}"));
         }

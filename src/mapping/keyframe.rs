@@ -87,8 +87,6 @@ pub(super) struct MappedKeyframe {
     /// On the host, where depth is swept for.
     gray: Option<GrayImage>,
     pub covisible: Vec<KeyframeId>,
-    /// At its last step; 1 before.
-    pub loss: f32,
 }
 
 /// All of a keyframe but its image, which the recording has.
@@ -101,7 +99,6 @@ pub(super) struct KeyframeState {
     scale_since_anchor: f64,
     exposure: Exposure,
     covisible: Vec<KeyframeId>,
-    loss: f32,
     tile_losses: TileLosses,
     is_resident: bool,
     /// Depth that was swept for, `[H, W]`: it depends on what the other poses were then. Nothing where the recording has it.
@@ -127,7 +124,6 @@ impl MappedKeyframe {
             image: Images::new(gpu, image, with_half)?,
             gray: matches!(keyframe.depth_source, DepthSource::Landmarks { .. }).then(|| plane_sweep::gray(&image.color)),
             covisible: keyframe.covisible.clone(),
-            loss: 1.0,
         })
     }
 
@@ -140,7 +136,6 @@ impl MappedKeyframe {
             scale_since_anchor: self.scale_since_anchor,
             exposure: self.exposure,
             covisible: self.covisible.clone(),
-            loss: self.loss,
             tile_losses: self.image.tile_losses(gpu)?,
             is_resident: self.is_resident(),
             swept: self.gray.is_some().then(swept).transpose()?,
@@ -177,7 +172,6 @@ impl MappedKeyframe {
             gray: state.swept.as_ref().map(|_| plane_sweep::gray(&image.color)),
             image: images,
             covisible: state.covisible.clone(),
-            loss: state.loss,
         };
         if !state.is_resident {
             restored.offload(gpu, store)?;

@@ -21,11 +21,11 @@ use super::gaussian_stats::GaussianStats;
 use super::image_store::ImageStore;
 use super::keyframe::{DepthSource, MappedKeyframe};
 use super::plane_sweep::{self, SourceView};
-use super::schedule::{self, Session, Step};
+use super::schedule::{self, Step};
 use super::{Keyframe, KeyframeId, MappingConfig, MappingError, PoseUpdate, exposure, initialise_from_points};
 use crate::geometry::Se3;
 use crate::gpu::Gpu;
-use crate::optimise::{AdamConfig, ErrorPixels, StepReport, TileSampling, Trainer, TrainingView};
+use crate::optimise::{AdamConfig, TileSampling, Trainer, TrainingView};
 use crate::render::{GpuCloud, Rendered};
 use crate::sequence::{KnownPoint, RectifiedImage};
 use crate::splat::{Exposure, GaussianCloud, ViewCamera};
@@ -133,8 +133,7 @@ impl Mapper {
             });
         }
         let report = self.optimise(iterations, stop)?;
-        let iterations = report.iterations + self.consolidate(stop)?;
-        Ok(KeyframeReport { id: keyframe.id, inserted, iterations, gaussians: self.cloud.len(), exposure, ..report })
+        Ok(KeyframeReport { id: keyframe.id, inserted, gaussians: self.cloud.len(), exposure, ..report })
     }
 
     /// Takes in points of the scene that are known before any keyframe, in the keyframes' world; `anchor` is the first of these.
@@ -233,8 +232,7 @@ impl Mapper {
         Some(Keyframe { image, ..keyframe.clone() })
     }
 
-    /// Steps over the window until all are taken or nothing more is gained; on the way some of them score the Gaussians, whose density is
-    /// then controlled. Reports what it did.
+    /// Steps over the window, of which some score the Gaussians, whose density is then controlled; then steps over all keyframes. Reports what it did.
     fn optimise(&mut self, iterations: usize, stop: &dyn Fn() -> bool) -> Result<KeyframeReport, MappingError> {
         if self.cloud.is_empty() {
             return Ok(KeyframeReport::default());
@@ -243,35 +241,38 @@ impl Mapper {
         let config = self.config.clone();
         let density = &config.density;
         let controlled = self.keyframes.len().is_multiple_of(density.every);
-        // The scored steps are among the steps.
-        let scored = self.scoring(density).filter(|_| controlled).map_or(0, |_| density.views.min(window.len()).min(iterations));
-        let unscored = iterations - scored;
-        let mut session = Session::new(window.clone(), unscored);
-        let due = (density.after_share * unscored as f32).round() as usize;
-        let before = self.steps_of(&mut session, due, stop)?;
+        let mut scoring = if controlled { self.scoring_steps(&window, density) } else { Vec::new() };
+        scoring.truncate(iterations);
+        let unscored = iterations - scoring.len();
+        let mut before = schedule::steps(&window, self.keyframes.len(), unscored, &mut self.rng, &config.window);
+        let after = before.split_off((density.after_share * unscored as f32).round() as usize);
+        // Together where they are one batch: whatever waits for the GPU waits once.
+        if before.len() + scoring.len() <= self.batch() {
+            scoring.splice(..0, before.drain(..));
+        }
+        let mut taken = self.take(&before, &config.adam, stop)?;
+        if controlled {
+            self.trainer.begin_scores(&self.cloud)?;
+        }
+        taken += self.take(&scoring, &config.adam, &|| false)?;
         self.stats.keyframe_mapped();
-        let (scored, (pruned, grown)) =
-            if controlled { (self.score(&window, density, &config.adam)?, self.control_density(density)?) } else { (0, (0, 0)) };
-        let after = self.steps_of(&mut session, unscored, stop)?;
-        let done = before.0 + after.0;
-        let psnr_db = (before.1 + after.1) / done.max(1) as f32;
-        Ok(KeyframeReport { pruned, grown, iterations: done + scored, psnr_db, ..KeyframeReport::default() })
+        let (pruned, grown) = if controlled { self.control_density(density)? } else { (0, 0) };
+        taken += self.take(&after, &config.adam, stop)?;
+        let psnr_db = taken.psnr_db();
+        taken += self.consolidate(stop)?;
+        Ok(KeyframeReport { pruned, grown, iterations: taken.steps, psnr_db, ..KeyframeReport::default() })
     }
 
-    /// Takes a session's steps until `end` are taken or nothing more is gained; returns their number and the sum of the PSNR before each.
-    fn steps_of(&mut self, session: &mut Session, end: usize, stop: &dyn Fn() -> bool) -> Result<(usize, f32), MappingError> {
-        let (mut psnr_sum, mut done) = (0.0, 0);
-        while !session.is_over(end) && !stop() {
-            let count = self.batch().min(end - session.taken());
-            let batch = session.next(count, &self.keyframes, &mut self.rng, &self.config.window, &self.config.schedule);
-            let adam = &self.config.clone().adam;
-            let reports = self.steps(&batch, None, self.tile_sampling(), adam)?;
-            psnr_sum += reports.iter().map(|r| r.loss.psnr_db()).sum::<f32>();
-            done += batch.len();
-            let losses: Vec<f32> = reports.iter().map(|r| r.loss.total(&self.config.loss)).collect();
-            session.take_note(&batch, &losses, self.config.schedule.min_gain);
+    /// Takes steps, in batches, until `stop`.
+    fn take(&mut self, steps: &[Step], adam: &AdamConfig, stop: &dyn Fn() -> bool) -> Result<Taken, MappingError> {
+        let mut taken = Taken::default();
+        for batch in steps.chunks(self.batch()) {
+            if stop() {
+                break;
+            }
+            taken += self.steps(batch, self.tile_sampling(), adam)?;
         }
-        Ok((done, psnr_sum))
+        Ok(taken)
     }
 
     /// Steps submitted at once.
@@ -284,32 +285,47 @@ impl Mapper {
         self.config.tile_sampling.sampling()
     }
 
-    fn steps(
-        &mut self,
-        batch: &[Step],
-        scored: Option<ErrorPixels>,
-        tile_sampling: Option<TileSampling>,
-        adam: &AdamConfig,
-    ) -> Result<Vec<StepReport>, MappingError> {
+    fn steps(&mut self, batch: &[Step], tile_sampling: Option<TileSampling>, adam: &AdamConfig) -> Result<Taken, MappingError> {
         let streamed = batch.iter().map(|step| self.keyframes[step.keyframe].streamed(step.coarse, &self.images));
         let streamed = streamed.collect::<Result<Vec<_>, _>>()?;
         let views = batch.iter().zip(&streamed).map(|(step, pixels)| {
             let keyframe = &self.keyframes[step.keyframe];
             let view = keyframe.view(step.coarse);
             let depth_confidence = if keyframe.depth_is_estimated() { self.config.plane_sweep.depth_confidence } else { 1.0 };
-            TrainingView { streamed: pixels.as_deref(), lr_scale: step.lr_scale, depth_confidence, scored, tile_sampling, ..view }
+            TrainingView { streamed: pixels.as_deref(), depth_confidence, scored: step.scored, tile_sampling, ..view }
         });
         let views: Vec<TrainingView<'_>> = views.collect();
         let started = Instant::now();
         let reports = self.trainer.steps(&self.cloud, &views, &self.config.loss, adam)?;
         self.step_times.extend(std::iter::repeat_n(started.elapsed() / batch.len().max(1) as u32, batch.len()));
+        let mut taken = Taken { steps: batch.len(), psnr_sum: 0.0 };
         for (step, report) in batch.iter().zip(&reports) {
-            let keyframe = &mut self.keyframes[step.keyframe];
-            keyframe.loss = report.loss.total(&self.config.loss);
-            if !keyframe.loss.is_finite() {
-                return Err(MappingError::NotFinite { id: keyframe.id });
+            if !report.loss.total(&self.config.loss).is_finite() {
+                return Err(MappingError::NotFinite { id: self.keyframes[step.keyframe].id });
             }
+            taken.psnr_sum += report.loss.psnr_db();
         }
-        Ok(reports)
+        Ok(taken)
+    }
+}
+
+/// Steps taken.
+#[derive(Clone, Copy, Debug, Default)]
+struct Taken {
+    steps: usize,
+    /// Of the PSNR of each step's view before it.
+    psnr_sum: f32,
+}
+
+impl Taken {
+    fn psnr_db(&self) -> f32 {
+        self.psnr_sum / self.steps.max(1) as f32
+    }
+}
+
+impl std::ops::AddAssign for Taken {
+    fn add_assign(&mut self, more: Self) {
+        self.steps += more.steps;
+        self.psnr_sum += more.psnr_sum;
     }
 }

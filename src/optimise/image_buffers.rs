@@ -1,6 +1,6 @@
 //! Buffers of the image loss, for each size of view in turn.
 
-use super::loss::GpuPixels;
+use super::loss::{GpuPixels, Pixels, TargetBuffers, TargetImage};
 use crate::gpu::{Gpu, GpuBuffer, GpuError};
 use crate::render::layout::{TILE_HEIGHT, TILE_WIDTH};
 
@@ -25,23 +25,37 @@ const SIZES_KEPT: usize = 4;
 #[derive(Debug)]
 pub(super) struct ImageBuffers {
     pub size: (u32, u32),
-    /// The step's target, copied to one place: bind groups over each view's own buffers would be made anew all the time.
-    pub target: GpuPixels,
+    /// Pixels of an offloaded target, while a step uses it.
+    streamed: Option<GpuPixels>,
     pub partials: GpuBuffer,
     pub gradients: GpuBuffer,
-    /// [tiles] of the step's view, those of tiles left out from earlier steps; its length is the number of terms that are summed.
-    pub loss_sums: GpuBuffer,
 }
 
 impl ImageBuffers {
     fn new(gpu: &Gpu, (width, height): (u32, u32)) -> Result<Self, GpuError> {
         Ok(Self {
             size: (width, height),
-            target: GpuPixels::blank(gpu, (width, height))?,
+            streamed: None,
             partials: GpuBuffer::storage(gpu, "loss partials", bordered_windows(width) * bordered_windows(height) * 48)?,
             gradients: GpuBuffer::storage(gpu, "image gradients", u64::from(width * height) * 32)?,
-            loss_sums: GpuBuffer::storage(gpu, "loss sums", tiles((width, height)) as u64 * 16)?,
         })
+    }
+
+    /// Uploads the pixels of an offloaded target, before the next submission.
+    pub fn stream(&mut self, gpu: &Gpu, pixels: &Pixels) -> Result<(), GpuError> {
+        let streamed = match self.streamed.take() {
+            Some(streamed) => streamed,
+            None => GpuPixels::blank(gpu, self.size)?,
+        };
+        streamed.write(gpu, pixels);
+        self.streamed = Some(streamed);
+        Ok(())
+    }
+
+    /// The target of a step: its own buffers, or those that its pixels were streamed to.
+    pub fn target<'a>(&'a self, target: &'a TargetImage) -> TargetBuffers<'a> {
+        let pixels = target.pixels.as_ref().or(self.streamed.as_ref()).expect("a view brings an offloaded target along");
+        TargetBuffers { color: &pixels.color, depth: &pixels.depth, tile_losses: &target.tile_losses }
     }
 }
 

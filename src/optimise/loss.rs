@@ -107,18 +107,20 @@ impl GpuPixels {
         Ok(Self { color: plane("target colour")?, depth: plane("target depth")? })
     }
 
-    /// Becomes a copy of an image of the same size.
-    pub fn encode_copy(&self, encoder: &mut wgpu::CommandEncoder, of: &Self) {
-        for (from, to) in [(&of.color, &self.color), (&of.depth, &self.depth)] {
-            encoder.copy_buffer_to_buffer(from.raw(), 0, to.raw(), 0, from.raw().size());
-        }
-    }
-
     /// Becomes an image of the same size, before the next submission.
     pub fn write(&self, gpu: &Gpu, pixels: &Pixels) {
         self.color.write(gpu, 0, &pixels.color);
         self.depth.write(gpu, 0, &pixels.depth_metres);
     }
+}
+
+/// A step's target as the loss binds it.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct TargetBuffers<'a> {
+    pub color: &'a GpuBuffer,
+    pub depth: &'a GpuBuffer,
+    /// `[tiles]` sums of the loss; those of tiles left out stay from earlier steps.
+    pub tile_losses: &'a GpuBuffer,
 }
 
 /// What a view should look like: 8-bit colour and sensor depth, on the GPU unless offloaded.
@@ -179,7 +181,8 @@ impl TargetImage {
     pub fn read_pixels(&self, gpu: &Gpu) -> Result<Option<Pixels>, GpuError> {
         let count = (self.width * self.height) as usize;
         let read = |on_gpu: &GpuPixels| {
-            Ok(Pixels { color: on_gpu.color.read(gpu, 0, count)?, depth_metres: on_gpu.depth.read(gpu, 0, count)? })
+            let read = gpu.read(None, &[on_gpu.color.part::<u32>(0, count), on_gpu.depth.part::<f32>(0, count)])?;
+            Ok(Pixels { color: read.part(0), depth_metres: read.part(1) })
         };
         self.pixels.as_ref().map(read).transpose()
     }

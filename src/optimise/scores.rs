@@ -1,11 +1,9 @@
 //! Scores of the Gaussians over some views, for density control: computed beside a training step, from its own tile lists and gradients.
 
 use super::LossConfig;
-use crate::gpu::{Gpu, GpuBuffer, GpuError, IndirectSize, Kernel};
+use crate::gpu::{Gpu, GpuBuffer, GpuError, IndirectSize, Kernel, UniformCell};
 use crate::render::layout::{Counter, ScoreSetup, VISIBLE_COUNTER};
 use crate::render::{GpuCloud, PreparedView, Rasterizer, shaders};
-
-use bytemuck::Zeroable;
 
 /// Definition of an error pixel (the high-error mask of FastGS).
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -14,6 +12,14 @@ pub struct ErrorPixels {
     pub error_ratio: f32,
     /// and is no noise: mean absolute colour error, 0 to 1.
     pub noise: f32,
+}
+
+impl ErrorPixels {
+    /// The GPU's copy.
+    pub(super) fn setup(&self, loss: &LossConfig, pixels: u32) -> ScoreSetup {
+        let Self { error_ratio, noise } = *self;
+        ScoreSetup { error_ratio, noise, ssim_weight: loss.ssim_weight, pixels: pixels as f32 }
+    }
 }
 
 /// What some views say of one Gaussian.
@@ -42,8 +48,8 @@ pub struct GaussianScore {
 pub(super) struct ScoredImage<'a> {
     /// `[2, H, W]` gradients of the loss by the image.
     pub gradients: &'a GpuBuffer,
-    pub loss_total: &'a GpuBuffer,
-    pub loss: &'a LossConfig,
+    /// The log of the step, which begins with the sums of the loss.
+    pub log: &'a GpuBuffer,
 }
 
 /// The scoring passes and their buffers.
@@ -51,7 +57,6 @@ pub(super) struct ScoredImage<'a> {
 pub(super) struct Scores {
     rasterize: Kernel,
     gather: Kernel,
-    setup: GpuBuffer,
     /// [2, capacity]
     scores: GpuBuffer,
     capacity: usize,
@@ -64,7 +69,6 @@ impl Scores {
         Ok(Self {
             rasterize: kernel(&shaders::RASTERIZE_SCORES),
             gather: kernel(&shaders::GATHER_SCORES),
-            setup: GpuBuffer::uniform(gpu, "score setup", &ScoreSetup::zeroed())?,
             scores: GpuBuffer::storage(gpu, "scores", 16)?,
             capacity: 0,
         })
@@ -79,8 +83,8 @@ impl Scores {
     pub fn reserve(&mut self, gpu: &Gpu, capacity: usize) -> Result<(), GpuError> {
         if capacity == self.capacity {
             let mut encoder = gpu.device.create_command_encoder(&Default::default());
-            encoder.clear_buffer(self.scores.raw(), 0, None);
-            gpu.queue.submit([encoder.finish()]);
+            gpu.clear(&mut encoder, &self.scores);
+            gpu.submit(encoder);
             return Ok(());
         }
         self.scores = GpuBuffer::storage(gpu, "scores", capacity as u64 * 32)?;
@@ -99,15 +103,12 @@ impl Scores {
         rasterizer: &Rasterizer,
         prepared: &PreparedView,
         image: &ScoredImage<'_>,
-        wrong: &ErrorPixels,
+        setup: UniformCell,
     ) {
         let (gpu, ws) = (rasterizer.gpu(), &rasterizer.workspace);
-        let pixels = prepared.view.pixels() as f32;
-        let setup =
-            ScoreSetup { error_ratio: wrong.error_ratio, noise: wrong.noise, ssim_weight: image.loss.ssim_weight, pixels };
-        self.setup.write(gpu, 0, &[setup]);
+        let (view, setup) = (rasterizer.view(prepared), rasterizer.uniforms.of(setup));
         let rasterize = [
-            (0, rasterizer.view()),
+            (0, view),
             (1, &ws.ranges),
             (2, &ws.slots[prepared.sorted]),
             (3, &ws.slot_gaussians),
@@ -116,19 +117,19 @@ impl Scores {
             (6, &ws.state),
             (7, image.gradients),
             (8, &ws.intersection_gradients),
-            (9, &self.setup),
-            (10, image.loss_total),
+            (9, setup),
+            (10, image.log),
         ];
         self.rasterize.dispatch(gpu, pass, &rasterize, rasterizer.form().workgroups(prepared.view.tiles()));
         let gather = [
-            (0, rasterizer.view()),
+            (0, view),
             (1, &ws.counters),
             (2, &ws.intersection_counts),
             (3, &ws.intersection_gradients),
             (4, &ws.projected),
             (5, &self.scores),
-            (6, &self.setup),
-            (7, image.loss_total),
+            (6, setup),
+            (7, image.log),
         ];
         let visible = IndirectSize { buffer: &ws.counters, offset: Counter::per_element_offset(VISIBLE_COUNTER) };
         self.gather.dispatch_indirect(gpu, pass, &gather, visible);
@@ -137,8 +138,9 @@ impl Scores {
     /// The sums over all views since the last clearing, `[N]` in map order.
     pub fn read(&self, gpu: &Gpu, cloud: &GpuCloud) -> Result<Vec<GaussianScore>, GpuError> {
         assert_eq!(self.capacity, cloud.capacity(), "the scores are those of this cloud");
-        let seen: Vec<[f32; 4]> = self.scores.read(gpu, 0, cloud.len())?;
-        let gradients: Vec<[f32; 4]> = self.scores.read(gpu, self.capacity, cloud.len())?;
+        let planes = [0, self.capacity].map(|first| self.scores.part::<[f32; 4]>(first, cloud.len()));
+        let read = gpu.read(None, &planes)?;
+        let (seen, gradients): (Vec<[f32; 4]>, Vec<[f32; 4]>) = (read.part(0), read.part(1));
         let score = |(s, g): (&[f32; 4], &[f32; 4])| GaussianScore {
             error_pixels: s[0],
             weighted_error_pixels: s[1],

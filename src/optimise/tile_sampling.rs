@@ -1,13 +1,12 @@
 //! Stochastic tile sampling: which tiles of a view a step uses, and what stands in place of the others.
 
-use bytemuck::Zeroable;
 use serde::Serialize;
 
 use super::LossConfig;
-use super::image_buffers::{self, ImageBuffers};
-use crate::gpu::{GpuBuffer, GpuError, Kernel, workgroups};
+use super::loss::TargetBuffers;
+use crate::gpu::{GpuBuffer, Kernel, UniformCell, workgroups};
 use crate::render::layout::TileSamplingSetup;
-use crate::render::{Rasterizer, shaders};
+use crate::render::{PreparedView, Rasterizer, shaders};
 
 /// Which tiles of a view a step uses, by each tile's loss when last sampled. Tiles of unknown loss are always sampled.
 /// The reported loss covers the whole view, with the last known loss of unsampled tiles.
@@ -26,36 +25,27 @@ pub struct TileSampling {
 pub(super) struct TileSampler {
     sample: Kernel,
     fill: Kernel,
-    setup: GpuBuffer,
 }
 
 impl TileSampler {
-    pub fn new(rasterizer: &Rasterizer) -> Result<Self, GpuError> {
+    pub fn new(rasterizer: &Rasterizer) -> Self {
         let (gpu, form) = (rasterizer.gpu(), rasterizer.form());
         let kernel = |source: &shaders::ShaderSource| Kernel::new(gpu, source.name, "main", &source.text(form));
-        Ok(Self {
-            sample: kernel(&shaders::SAMPLE_TILES),
-            fill: kernel(&shaders::FILL_UNSAMPLED),
-            setup: GpuBuffer::uniform(gpu, "tile sampling", &TileSamplingSetup::zeroed())?,
-        })
+        Self { sample: kernel(&shaders::SAMPLE_TILES), fill: kernel(&shaders::FILL_UNSAMPLED) }
     }
 
-    /// Draws the tiles of the step, before the forward rendering; `seed` is that of the draw.
+    /// Draws the tiles of the step, before the forward rendering.
     pub fn encode_sample(
         &self,
         pass: &mut wgpu::ComputePass<'_>,
         rasterizer: &Rasterizer,
-        images: &ImageBuffers,
-        loss: &LossConfig,
-        sampling: &TileSampling,
-        seed: u32,
+        prepared: &PreparedView,
+        tile_losses: &GpuBuffer,
+        setup: UniformCell,
     ) {
-        let (gpu, ws) = (rasterizer.gpu(), &rasterizer.workspace);
-        let TileSampling { share, min_share, noise } = *sampling;
-        let LossConfig { ssim_weight, depth_weight, .. } = *loss;
-        self.setup.write(gpu, 0, &[TileSamplingSetup { share, min_share, noise, ssim_weight, depth_weight, seed }]);
-        let bindings = [(0, rasterizer.view()), (1, &self.setup), (2, &images.loss_sums), (3, &ws.unsampled)];
-        self.sample.dispatch(gpu, pass, &bindings, [1, 1, 1]);
+        let (view, setup) = (rasterizer.view(prepared), rasterizer.uniforms.of(setup));
+        let bindings = [(0, view), (1, setup), (2, tile_losses), (3, rasterizer.unsampled(prepared))];
+        self.sample.dispatch(rasterizer.gpu(), pass, &bindings, [1, 1, 1]);
     }
 
     /// Copies the recorded image into unsampled tiles, before the loss.
@@ -63,12 +53,21 @@ impl TileSampler {
         &self,
         pass: &mut wgpu::ComputePass<'_>,
         rasterizer: &Rasterizer,
-        images: &ImageBuffers,
-        loss_setup: &GpuBuffer,
+        prepared: &PreparedView,
+        target: &TargetBuffers<'_>,
+        loss_setup: UniformCell,
     ) {
-        let (gpu, ws, target) = (rasterizer.gpu(), &rasterizer.workspace, &images.target);
-        let bindings = [(0, rasterizer.view()), (1, &ws.unsampled), (2, &target.color), (3, &ws.color_depth), (4, loss_setup)];
-        let tiles = image_buffers::tiles(images.size) as u32;
-        self.fill.dispatch(gpu, pass, &bindings, workgroups(tiles));
+        let (view, setup, ws) = (rasterizer.view(prepared), rasterizer.uniforms.of(loss_setup), &rasterizer.workspace);
+        let bindings = [(0, view), (1, rasterizer.unsampled(prepared)), (2, target.color), (3, &ws.color_depth), (4, setup)];
+        self.fill.dispatch(rasterizer.gpu(), pass, &bindings, workgroups(prepared.view.tiles()));
+    }
+}
+
+impl TileSampling {
+    /// The GPU's copy; `seed` is that of the draw.
+    pub(super) fn setup(&self, loss: &LossConfig, seed: u32) -> TileSamplingSetup {
+        let Self { share, min_share, noise } = *self;
+        let LossConfig { ssim_weight, depth_weight, .. } = *loss;
+        TileSamplingSetup { share, min_share, noise, ssim_weight, depth_weight, seed }
     }
 }

@@ -8,8 +8,6 @@ use std::time::{Duration, Instant};
 
 pub use state::TrainerState;
 
-use bytemuck::{Pod, Zeroable};
-
 use super::image_buffers::{self, ImageBuffers};
 use super::kernels::Kernels;
 use super::scores::{ErrorPixels, GaussianScore, ScoredImage, Scores};
@@ -17,8 +15,8 @@ use super::tile_sampling::{TileSampler, TileSampling};
 use super::{AdamConfig, LossConfig, LossTerms, Pixels, TargetImage};
 use crate::geometry::Pinhole;
 use crate::gpu::{Gpu, GpuBuffer, GpuError};
-use crate::render::layout::{AdamSetup, COUNTERS, Counter, LossSetup};
-use crate::render::{BlendForm, GpuCloud, Rasterizer, Rendered, ViewCounts, cloud_from_planes};
+use crate::render::layout::StepLog;
+use crate::render::{BlendForm, GpuCloud, Rasterizer, Rendered, ViewCounts};
 use crate::splat::{Exposure, GaussianCloud, ViewCamera};
 
 /// What a step did.
@@ -59,14 +57,6 @@ impl<'a> TrainingView<'a> {
     }
 }
 
-/// What a step leaves behind on the GPU: sums of the loss, and the counters.
-#[repr(C)]
-#[derive(Clone, Copy, Debug, Pod, Zeroable)]
-struct StepLog {
-    loss: [f32; 4],
-    counters: [Counter; COUNTERS as usize],
-}
-
 /// Gradient of a loss by the map.
 #[derive(Clone, Debug)]
 pub struct Gradients {
@@ -87,15 +77,15 @@ pub struct ImageGradients {
 
 /// Where the backward pass starts from.
 enum Objective<'a> {
-    /// The loss of a view against its target.
-    Image { view: TrainingView<'a>, loss: &'a LossConfig },
+    /// The loss of a view against its target, and which of the logs receives it.
+    Image { view: TrainingView<'a>, loss: &'a LossConfig, log: usize },
     /// Gradients by the image are in the buffer already.
     Given,
 }
 
 /// What the backward pass ends in.
 enum Sink<'a> {
-    Adam,
+    Adam(&'a AdamConfig),
     Gradient(&'a GpuBuffer),
 }
 
@@ -109,12 +99,17 @@ pub struct Trainer {
     /// Steps submitted so far, and the host's time to encode and submit them.
     steps: usize,
     encode_time: Duration,
-    adam: GpuBuffer,
-    loss_setup: GpuBuffer,
     /// Of each size of view, the present one first.
     images: Vec<ImageBuffers>,
-    loss_total: GpuBuffer,
+    /// Logs of the steps of a submission, and windows on each.
+    log: GpuBuffer,
+    logs: Vec<GpuBuffer>,
 }
+
+/// Most steps of a submission: their uniforms fit.
+const STEPS_AT_ONCE: usize = 12;
+/// Bytes between two logs: the least alignment of their bindings that every adapter has.
+const LOG_STRIDE: usize = 256;
 
 impl Trainer {
     /// The mark that ends a step's last stage in the profile.
@@ -138,23 +133,24 @@ impl Trainer {
         let gpu = rasterizer.gpu();
         let kernels = Kernels::new(&rasterizer);
         gpu.check()?;
+        let log = GpuBuffer::computed_uniform(gpu, "step logs", (STEPS_AT_ONCE * LOG_STRIDE) as u64)?;
+        let logs = (0..STEPS_AT_ONCE).map(|i| log.window((i * LOG_STRIDE) as u64, LOG_STRIDE as u64)).collect();
         Ok(Self {
             kernels,
             scores: Scores::new(&rasterizer)?,
-            sampler: TileSampler::new(&rasterizer)?,
+            sampler: TileSampler::new(&rasterizer),
             steps: 0,
             encode_time: Duration::ZERO,
-            adam: GpuBuffer::uniform(gpu, "Adam", &AdamSetup::zeroed())?,
-            loss_setup: GpuBuffer::uniform(gpu, "loss setup", &LossSetup::zeroed())?,
             images: Vec::new(),
-            loss_total: GpuBuffer::computed_uniform(gpu, "loss", 16)?,
+            log,
+            logs,
             rasterizer,
         })
     }
 
     /// For each view in turn: renders the map, compares it with the target, and moves the Gaussians that were blended by one step of
-    /// Adam. The steps are submitted without waiting in between; what they report is read at the end. A step whose intersections did not
-    /// fit moved nothing and is repeated after the others, with larger buffers.
+    /// Adam. The steps are submitted together, without waiting in between; what they report is read at the end. A step whose intersections
+    /// did not fit moved nothing and is repeated after the others, with larger buffers.
     ///
     /// # Errors
     /// [`GpuError`] if a buffer does not fit or the device fails.
@@ -165,42 +161,60 @@ impl Trainer {
         loss: &LossConfig,
         adam: &AdamConfig,
     ) -> Result<Vec<StepReport>, GpuError> {
-        let gpu = self.rasterizer.gpu().clone();
-        let log = GpuBuffer::storage(&gpu, "step log", (views.len() * std::mem::size_of::<StepLog>()) as u64)?;
         let mut reports = vec![StepReport::default(); views.len()];
         let mut pending: Vec<usize> = (0..views.len()).collect();
         while !pending.is_empty() {
-            for (entry, &i) in pending.iter().enumerate() {
-                let TrainingView { camera, scored, lr_scale, tile_sampling, .. } = &views[i];
-                let view = TrainingView { tile_sampling: tile_sampling.filter(|_| scored.is_none()), ..views[i] };
-                let objective = Objective::Image { view, loss };
-                let started = Instant::now();
-                self.adam.write(&gpu, 0, &[adam.setup(self.steps, *lr_scale)]);
-                let mut encoder = gpu.device.create_command_encoder(&Default::default());
-                self.encode(&mut encoder, cloud, &Viewpoint { camera, background: [0.0; 3] }, &objective, &Sink::Adam)?;
-                self.steps += 1;
-                self.encode_log(&mut encoder, &log, entry);
-                gpu.queue.submit([encoder.finish()]);
-                self.encode_time += started.elapsed();
-            }
-            let entries: Vec<StepLog> = log.read(&gpu, 0, pending.len())?;
             let mut repeat = Vec::new();
-            for (&i, entry) in pending.iter().zip(&entries) {
-                match self.rasterizer.counts(&entry.counters) {
-                    Some(counts) => {
-                        let pixels = views[i].target.width * views[i].target.height;
-                        let loss = LossTerms::from_sums(entry.loss, pixels);
-                        reports[i] = StepReport { loss, counts };
+            for chunk in pending.chunks(STEPS_AT_ONCE) {
+                let chosen: Vec<&TrainingView<'_>> = chunk.iter().map(|&i| &views[i]).collect();
+                let logs = self.steps_at_once(cloud, &chosen, loss, adam)?;
+                for (&i, log) in chunk.iter().zip(&logs) {
+                    let pixels = views[i].target.width * views[i].target.height;
+                    match self.rasterizer.counts(&log.counters) {
+                        Some(counts) => reports[i] = StepReport { loss: LossTerms::from_sums(log.loss, pixels), counts },
+                        None => repeat.push(i),
                     }
-                    None => repeat.push(i),
+                    self.rasterizer.reserve_for(&log.counters)?;
                 }
-            }
-            for entry in &entries {
-                self.rasterizer.reserve_for(&entry.counters)?;
             }
             pending = repeat;
         }
         Ok(reports)
+    }
+
+    /// Takes up to [`STEPS_AT_ONCE`] steps and reads their logs. They are one submission where their views have one size, and none of them but the
+    /// first streams its target.
+    fn steps_at_once(
+        &mut self,
+        cloud: &GpuCloud,
+        views: &[&TrainingView<'_>],
+        loss: &LossConfig,
+        adam: &AdamConfig,
+    ) -> Result<Vec<StepLog>, GpuError> {
+        let gpu = self.rasterizer.gpu().clone();
+        let size = |view: &TrainingView<'_>| (view.target.width, view.target.height);
+        let mut taken = 0;
+        for together in views.chunk_by(|before, view| view.streamed.is_none() && size(before) == size(view)) {
+            let started = Instant::now();
+            let mut encoder = gpu.device.create_command_encoder(&Default::default());
+            let mut pass = encoder.begin_compute_pass(&Default::default());
+            for view in together {
+                let view = TrainingView { tile_sampling: view.tile_sampling.filter(|_| view.scored.is_none()), ..**view };
+                let viewpoint = Viewpoint { camera: &view.camera, background: [0.0; 3] };
+                let objective = Objective::Image { view, loss, log: taken };
+                self.encode(&mut pass, cloud, &viewpoint, &objective, &Sink::Adam(adam))?;
+                self.steps += 1;
+                taken += 1;
+            }
+            drop(pass);
+            self.rasterizer.uniforms.upload(&gpu);
+            gpu.submit(encoder);
+            self.encode_time += started.elapsed();
+        }
+        let words = LOG_STRIDE / std::mem::size_of::<u32>();
+        let log: Vec<u32> = self.log.read(&gpu, 0, taken * words)?;
+        let entry = |bytes: &[u32]| bytemuck::pod_read_unaligned(&bytemuck::cast_slice(bytes)[..std::mem::size_of::<StepLog>()]);
+        Ok(log.chunks_exact(words).map(entry).collect())
     }
 
     /// Renders a view over `background` and reads it back.
@@ -253,9 +267,10 @@ impl Trainer {
         loss: &LossConfig,
     ) -> Result<Gradients, GpuError> {
         let gpu = self.rasterizer.gpu().clone();
-        let objective = Objective::Image { view: TrainingView::new(*camera, target), loss };
+        let objective = Objective::Image { view: TrainingView::new(*camera, target), loss, log: 0 };
         let mut gradients = self.collect(cloud, camera, [0.0; 3], &objective)?;
-        gradients.loss = self.read_loss(&gpu, target)?;
+        let loss: Vec<[f32; 4]> = self.logs[0].read(&gpu, 0, 1)?;
+        gradients.loss = LossTerms::from_sums(loss[0], target.width * target.height);
         Ok(gradients)
     }
 
@@ -287,12 +302,9 @@ impl Trainer {
         objective: &Objective<'_>,
     ) -> Result<Gradients, GpuError> {
         let gpu = self.rasterizer.gpu().clone();
-        let sink = GpuBuffer::storage(&gpu, "gradients", cloud.parameters().raw().size())?;
+        let sink = GpuBuffer::storage(&gpu, "gradients", cloud.parameters().size())?;
         self.run(cloud, &Viewpoint { camera, background }, objective, &Sink::Gradient(&sink))?;
-        let planes = (0..cloud.planes())
-            .map(|plane| sink.read(&gpu, plane * cloud.capacity(), cloud.len()))
-            .collect::<Result<Vec<_>, _>>()?;
-        let cloud = cloud_from_planes(cloud.sh_degree(), &planes);
+        let cloud = cloud.read_planes(&gpu, &sink)?;
         Ok(Gradients { loss: LossTerms::default(), cloud })
     }
 
@@ -307,8 +319,14 @@ impl Trainer {
         let gpu = self.rasterizer.gpu().clone();
         loop {
             let mut encoder = gpu.device.create_command_encoder(&Default::default());
-            self.encode(&mut encoder, cloud, viewpoint, objective, sink)?;
-            gpu.queue.submit([encoder.finish()]);
+            if let Sink::Gradient(buffer) = sink {
+                gpu.clear(&mut encoder, buffer);
+            }
+            let mut pass = encoder.begin_compute_pass(&Default::default());
+            self.encode(&mut pass, cloud, viewpoint, objective, sink)?;
+            drop(pass);
+            self.rasterizer.uniforms.upload(&gpu);
+            gpu.submit(encoder);
             if self.rasterizer.finish()?.is_some() {
                 return Ok(());
             }
@@ -318,51 +336,45 @@ impl Trainer {
     /// Encodes one whole step.
     fn encode(
         &mut self,
-        encoder: &mut wgpu::CommandEncoder,
+        pass: &mut wgpu::ComputePass<'_>,
         cloud: &GpuCloud,
         viewpoint: &Viewpoint<'_>,
         objective: &Objective<'_>,
         sink: &Sink<'_>,
     ) -> Result<(), GpuError> {
         let gpu = self.rasterizer.gpu().clone();
-        let prepared = self.rasterizer.prepare(cloud, viewpoint.camera, viewpoint.background)?;
+        let mut prepared = self.rasterizer.prepare(cloud, viewpoint.camera, viewpoint.background)?;
         image_buffers::choose(&mut self.images, &gpu, (prepared.view.width, prepared.view.height))?;
-        self.rasterizer.encode_clear(encoder);
-        if let Objective::Image { view: TrainingView { target, streamed, .. }, .. } = objective {
-            match (&target.pixels, streamed) {
-                (Some(pixels), _) => self.images[0].target.encode_copy(encoder, pixels),
-                (None, streamed) => self.images[0].target.write(&gpu, streamed.expect("a view brings an offloaded target along")),
+        match objective {
+            Objective::Image { view, loss, log } => {
+                if let (None, Some(pixels)) = (&view.target.pixels, view.streamed) {
+                    self.images[0].stream(&gpu, pixels)?;
+                }
+                prepared.samples_tiles = view.tile_sampling.is_some();
+                let lr_scale = view.lr_scale;
+                let cells = self.put_uniforms(view, loss, &prepared);
+                let target = self.images[0].target(view.target);
+                if let Some(setup) = cells.sampling {
+                    self.sampler.encode_sample(pass, &self.rasterizer, &prepared, target.tile_losses, setup);
+                }
+                self.rasterizer.encode_forward(pass, cloud.parameters(), &prepared);
+                if cells.sampling.is_some() {
+                    self.sampler.encode_fill(pass, &self.rasterizer, &prepared, &target, cells.loss);
+                }
+                self.encode_loss(pass, &prepared, &target, cells.loss, &self.logs[*log]);
+                if let Some(setup) = cells.scores {
+                    let image = ScoredImage { gradients: &self.images[0].gradients, log: &self.logs[*log] };
+                    self.scores.encode(pass, &self.rasterizer, &prepared, &image, setup);
+                }
+                self.encode_backward(pass, cloud, &prepared, sink, lr_scale);
             }
-            copy(encoder, &target.tile_losses, &self.images[0].loss_sums);
-        }
-        if let Sink::Gradient(buffer) = sink {
-            encoder.clear_buffer(buffer.raw(), 0, None);
-        }
-        let mut pass = encoder.begin_compute_pass(&Default::default());
-        if let Objective::Image { view: TrainingView { tile_sampling: Some(sampling), .. }, loss } = objective {
-            self.sampler.encode_sample(&mut pass, &self.rasterizer, &self.images[0], loss, sampling, self.steps as u32);
-        }
-        self.rasterizer.encode_forward(&mut pass, cloud.parameters(), &prepared);
-        if let Objective::Image { view, loss } = objective {
-            if view.tile_sampling.is_some() {
-                self.sampler.encode_fill(&mut pass, &self.rasterizer, &self.images[0], &self.loss_setup);
+            Objective::Given => {
+                self.rasterizer.encode_forward(pass, cloud.parameters(), &prepared);
+                self.encode_backward(pass, cloud, &prepared, sink, 1.0);
             }
-            self.encode_loss(&mut pass, loss, view);
-            let image = ScoredImage { gradients: &self.images[0].gradients, loss_total: &self.loss_total, loss };
-            view.scored.iter().for_each(|pixels| self.scores.encode(&mut pass, &self.rasterizer, &prepared, &image, pixels));
         }
-        self.encode_backward(&mut pass, cloud, &prepared, sink);
-        gpu.mark(&mut pass, Self::END_MARK);
-        drop(pass);
-        if let Objective::Image { view, .. } = objective {
-            copy(encoder, &self.images[0].loss_sums, &view.target.tile_losses);
-        }
+        gpu.mark(pass, Self::END_MARK);
         Ok(())
-    }
-
-    fn read_loss(&self, gpu: &Gpu, target: &TargetImage) -> Result<LossTerms, GpuError> {
-        let total: Vec<[f32; 4]> = self.loss_total.read(gpu, 0, 1)?;
-        Ok(LossTerms::from_sums(total[0], target.width * target.height))
     }
 }
 
@@ -370,8 +382,4 @@ impl Trainer {
 struct Viewpoint<'a> {
     camera: &'a ViewCamera,
     background: [f32; 3],
-}
-
-fn copy(encoder: &mut wgpu::CommandEncoder, from: &GpuBuffer, to: &GpuBuffer) {
-    encoder.copy_buffer_to_buffer(from.raw(), 0, to.raw(), 0, from.raw().size());
 }

@@ -10,7 +10,7 @@ pub use motion::RunMotion;
 use super::layout::{BlendForm, GEOMETRY_PLANES, GatherSetup};
 use super::plan::{GaussianGeometry, Plan};
 use super::shaders;
-use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, plain, workgroups};
+use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, Part, plain, workgroups};
 use crate::splat::{GaussianCloud, ShDegree};
 
 /// Parameters, first and second moments, averages.
@@ -102,7 +102,7 @@ impl GpuCloud {
 
     /// Bytes that it has at present.
     pub fn bytes(&self) -> u64 {
-        self.buffers().into_iter().chain(&self.spare).map(|buffer| buffer.raw().size()).sum()
+        self.buffers().into_iter().chain(&self.spare).map(|buffer| buffer.size()).sum()
     }
 
     /// Buffers are made for at most `limit` Gaussians from now on; whoever appends must keep to it.
@@ -238,7 +238,7 @@ impl GpuCloud {
             let mut pass = encoder.begin_compute_pass(&Default::default());
             gather.dispatch(gpu, &mut pass, &[(0, &setup), (1, &list), (2, buffer), (3, &to)], size);
             drop(pass);
-            gpu.queue.submit([encoder.finish()]);
+            gpu.submit(encoder);
             *spare = Some(std::mem::replace(buffer, to));
         }
         if resized {
@@ -258,8 +258,9 @@ impl GpuCloud {
     /// # Errors
     /// [`GpuError`] if the device fails.
     pub fn read_geometry(&self, gpu: &Gpu) -> Result<Vec<GaussianGeometry>, GpuError> {
-        let [positions, scales, rotations] = [0, 1, 2].map(|plane| self.read_plane(gpu, plane));
-        let (positions, scales, rotations) = (positions?, scales?, rotations?);
+        let parts: Vec<Part<'_>> = self.parts(&self.averages).take(GEOMETRY_PLANES).collect();
+        let read = gpu.read(None, &parts)?;
+        let [positions, scales, rotations] = [0, 1, 2].map(|plane| read.part::<[f32; 4]>(plane));
         let geometry = |i: usize| {
             let ([x, y, z, raw_opacity], [a, b, c, _], [qw, qx, qy, qz]) = (positions[i], scales[i], rotations[i]);
             let (mean, log_scale, rotation) = (Vec3::new(x, y, z), Vec3::new(a, b, c), Quat::from_xyzw(qx, qy, qz, qw));
@@ -268,9 +269,17 @@ impl GpuCloud {
         Ok((0..self.count).map(geometry).collect())
     }
 
-    /// Reads one plane of the averages, `[N]`.
-    fn read_plane(&self, gpu: &Gpu, plane: usize) -> Result<Vec<[f32; 4]>, GpuError> {
-        self.averages.read(gpu, plane * self.capacity, self.count)
+    /// The filled part of each plane of a buffer of the map's shape, `[N]` vec4.
+    fn parts<'a>(&self, buffer: &'a GpuBuffer) -> impl Iterator<Item = Part<'a>> + use<'a> {
+        let (planes, capacity, count) = (self.planes(), self.capacity, self.count);
+        (0..planes).map(move |plane| buffer.part::<[f32; 4]>(plane * capacity, count))
+    }
+
+    /// Reads a buffer of the map's shape: the map itself, or gradients by it.
+    pub(crate) fn read_planes(&self, gpu: &Gpu, buffer: &GpuBuffer) -> Result<GaussianCloud, GpuError> {
+        let read = gpu.read(None, &self.parts(buffer).collect::<Vec<_>>())?;
+        let planes: Vec<Vec<[f32; 4]>> = (0..self.planes()).map(|plane| read.part(plane)).collect();
+        Ok(cloud_from_planes(self.sh_degree, &planes))
     }
 
     /// Reads the whole map as it is shown.
@@ -278,8 +287,7 @@ impl GpuCloud {
     /// # Errors
     /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn download(&self, gpu: &Gpu) -> Result<GaussianCloud, GpuError> {
-        let read = (0..self.planes()).map(|plane| self.read_plane(gpu, plane)).collect::<Result<Vec<_>, _>>()?;
-        Ok(cloud_from_planes(self.sh_degree, &read))
+        self.read_planes(gpu, &self.averages)
     }
 
     /// All that training needs to go on as if it had never stopped.
@@ -289,9 +297,8 @@ impl GpuCloud {
     pub fn state(&self, gpu: &Gpu) -> Result<CloudState, GpuError> {
         let mut values = Vec::with_capacity(BUFFERS * self.planes() * self.count);
         for buffer in self.buffers() {
-            for plane in 0..self.planes() {
-                values.extend(buffer.read::<[f32; 4]>(gpu, plane * self.capacity, self.count)?);
-            }
+            let read = gpu.read(None, &self.parts(buffer).collect::<Vec<_>>())?;
+            (0..self.planes()).for_each(|plane| values.extend(read.part::<[f32; 4]>(plane)));
         }
         Ok(CloudState { capacity: self.capacity, limit: self.limit, room: self.room, values })
     }
@@ -321,8 +328,8 @@ pub fn planes(sh_degree: ShDegree) -> usize {
     GEOMETRY_PLANES + sh_degree.coefficients()
 }
 
-/// A cloud from its planes, each `[N]`; also reads gradients, which have the same layout.
-pub fn cloud_from_planes(sh_degree: ShDegree, read: &[Vec<[f32; 4]>]) -> GaussianCloud {
+/// A cloud from its planes, each `[N]`.
+fn cloud_from_planes(sh_degree: ShDegree, read: &[Vec<[f32; 4]>]) -> GaussianCloud {
     let xyz = |v: &[f32; 4]| Vec3::new(v[0], v[1], v[2]);
     let count = read[0].len();
     let coefficients = &read[GEOMETRY_PLANES..];

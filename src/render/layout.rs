@@ -13,8 +13,6 @@ pub const TILE_WIDTH: u32 = 16;
 pub const TILE_HEIGHT: u32 = 8;
 /// Parts of the list of tiles from which successive workgroups of the blending passes take in turn.
 pub const LIST_PARTS: u32 = 16;
-/// Elements that one workgroup scans, and keys that one workgroup sorts.
-pub const SCAN_BLOCK: u32 = 2048;
 /// Keys that one workgroup sorts.
 pub const SORT_BLOCK: u32 = 1024;
 /// Blocks whose digit counts one workgroup scans.
@@ -77,7 +75,10 @@ impl BlendForm {
 
     /// Workgroups of a blending pass over so many tiles.
     pub fn workgroups(self, tiles: u32) -> [u32; 3] {
-        workgroups(tiles.div_ceil(self.group_tiles()).next_multiple_of(LIST_PARTS))
+        match self {
+            Self::Wide => workgroups(tiles),
+            Self::Narrow => workgroups(tiles.div_ceil(self.group_tiles()).next_multiple_of(LIST_PARTS)),
+        }
     }
 }
 
@@ -99,8 +100,8 @@ pub fn wgsl_constants(form: BlendForm) -> String {
         ("STRIPS", form.strips()),
         ("GROUP_TILES", form.group_tiles()),
         ("LIST_PARTS", LIST_PARTS),
-        ("SCAN_BLOCK", SCAN_BLOCK),
         ("SORT_BLOCK", SORT_BLOCK),
+        ("DEPTH_KEY_STEP", DEPTH_KEY_STEP),
         ("SORT_CHUNK", SORT_CHUNK),
         ("VISIBLE_COUNTER", VISIBLE_COUNTER),
         ("INTERSECTION_COUNTER", INTERSECTION_COUNTER),
@@ -225,16 +226,19 @@ host_twins! {
         /// Workgroups for one sorting block a workgroup.
         per_block: [u32; 3],
     }
-    /// Input and output of a prefix sum (`shaders/scan.wgsl`).
+    /// Which of the two prefix sums (`shaders/scan_blocks.wgsl`).
     ScanSetup {
-        /// Values, where no counter holds their number.
-        count: u32,
-        /// Counter that holds their number.
-        counter_in: u32,
         /// Counter that receives the total.
-        counter_out: u32,
-        /// Upper bound of the total.
-        capacity: u32,
+        counter: u32,
+        /// Unused.
+        pad: [u32; 3],
+    }
+    /// What a step leaves behind (`shaders/loss_reduce.wgsl`).
+    StepLog {
+        /// Sums over the pixels: |colour error|, SSIM, |depth error|, squared colour error.
+        loss: [f32; 4],
+        /// Work of the view.
+        counters: [Counter; COUNTERS as usize],
     }
     /// One digit of a radix sort (`shaders/sort.wgsl`).
     SortSetup {

@@ -8,7 +8,6 @@ pub(crate) mod shaders;
 mod sort;
 mod workspace;
 
-pub(crate) use cloud::cloud_from_planes;
 pub use cloud::{CloudState, GpuCloud, RunMotion};
 pub use layout::BlendForm;
 pub use plan::{Child, GaussianGeometry, Plan};

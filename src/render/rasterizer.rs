@@ -5,18 +5,16 @@
 
 use std::sync::Arc;
 
-use bytemuck::Zeroable;
-
 use super::cloud::GpuCloud;
 use super::layout::{BlendForm, COUNTERS, Counter, INTERSECTION_COUNTER, ScanSetup, TileListsSetup, VISIBLE_COUNTER, View};
 use super::shaders;
-use super::sort::{Scan, ScanJob, Sort, SortJob};
+use super::sort::{Sort, SortJob};
 use super::workspace::{Capacities, Workspace};
-use crate::gpu::{Gpu, GpuBuffer, GpuError, IndirectSize, Kernel, workgroups};
+use crate::gpu::{Gpu, GpuBuffer, GpuError, IndirectSize, Kernel, UniformCell, Uniforms, workgroups};
 use crate::splat::{Exposure, ViewCamera};
 
-/// Depth keys are whole f32.
-const DEPTH_KEY_BITS: u32 = 32;
+/// See [`depth_key`](crate::splat::model::depth_key).
+const DEPTH_KEY_BITS: u32 = 16;
 
 /// A rendered view on the host.
 #[derive(Clone, Debug, PartialEq)]
@@ -66,7 +64,7 @@ struct Kernels {
     tile_ranges: Kernel,
     order_tiles: Kernel,
     rasterize_forward: Kernel,
-    scan: Scan,
+    scan_blocks: Kernel,
     sort: Sort,
 }
 
@@ -78,20 +76,24 @@ pub struct Rasterizer {
     kernels: Kernels,
     count_mode: GpuBuffer,
     emit_mode: GpuBuffer,
-    // Written anew for each view. A write takes effect before the next submission, so one view at a time may be prepared.
-    view: GpuBuffer,
     visible_scan: GpuBuffer,
     intersection_scan: GpuBuffer,
+    /// Those of the views and whatever else follows them in the same submission.
+    pub(crate) uniforms: Uniforms,
     pub(crate) workspace: Workspace,
 }
 
 /// A view prepared for encoding, and where its sorted intersections will lie.
 #[derive(Clone, Copy, Debug)]
 pub struct PreparedView {
-    /// Constants of the view, as uploaded.
+    /// Constants of the view.
     pub view: View,
+    /// Their place among the uniforms.
+    pub uniform: UniformCell,
     /// Which of `workspace.slots` holds the sorted intersections.
     pub sorted: usize,
+    /// Whether a draw precedes the view, which leaves out some of the tiles.
+    pub samples_tiles: bool,
 }
 
 impl Rasterizer {
@@ -117,18 +119,19 @@ impl Rasterizer {
             tile_ranges: kernel(&shaders::TILE_RANGES),
             order_tiles: kernel(&shaders::ORDER_TILES),
             rasterize_forward: kernel(&shaders::RASTERIZE_FORWARD),
-            scan: Scan::new(&gpu),
+            scan_blocks: kernel(&shaders::SCAN_BLOCKS),
             sort: Sort::new(&gpu)?,
         };
         gpu.check()?;
+        let scan = |label: &str, counter| GpuBuffer::uniform(&gpu, label, &ScanSetup { counter, pad: [0; 3] });
         Ok(Self {
             form,
             kernels,
             count_mode: GpuBuffer::uniform(&gpu, "count mode", &TileListsSetup { emit: 0, pad: [0; 3] })?,
             emit_mode: GpuBuffer::uniform(&gpu, "emit mode", &TileListsSetup { emit: 1, pad: [0; 3] })?,
-            view: GpuBuffer::uniform(&gpu, "view", &View::zeroed())?,
-            visible_scan: GpuBuffer::uniform(&gpu, "visible scan", &ScanSetup::zeroed())?,
-            intersection_scan: GpuBuffer::uniform(&gpu, "intersection scan", &ScanSetup::zeroed())?,
+            visible_scan: scan("visible scan", VISIBLE_COUNTER)?,
+            intersection_scan: scan("intersection scan", INTERSECTION_COUNTER)?,
+            uniforms: Uniforms::new(&gpu)?,
             workspace: Workspace::new(&gpu)?,
             gpu,
         })
@@ -139,9 +142,14 @@ impl Rasterizer {
         &self.gpu
     }
 
-    /// The uniform of the prepared view.
-    pub fn view(&self) -> &GpuBuffer {
-        &self.view
+    /// The uniform of a prepared view.
+    pub fn view(&self, prepared: &PreparedView) -> &GpuBuffer {
+        self.uniforms.of(prepared.uniform)
+    }
+
+    /// The mask of tiles that a prepared view leaves out.
+    pub fn unsampled(&self, prepared: &PreparedView) -> &GpuBuffer {
+        if prepared.samples_tiles { &self.workspace.unsampled } else { &self.workspace.none_unsampled }
     }
 
     /// The form of the blending passes.
@@ -162,7 +170,8 @@ impl Rasterizer {
         self.workspace.reserve(&self.gpu, capacities)
     }
 
-    /// Reserves buffers for the view and uploads it; it must be submitted before another is prepared.
+    /// Reserves buffers for the view and adds it to the uniforms, which must be uploaded before the submission. All views of a submission
+    /// have one size: buffers that grow are replaced.
     ///
     /// # Errors
     /// [`GpuError`] if a buffer does not fit or the device fails.
@@ -175,39 +184,34 @@ impl Rasterizer {
         view.capacity = cloud.capacity() as u32;
         view.sh_degree = u32::from(cloud.sh_degree().get());
         view.intersection_capacity = self.workspace.intersection_capacity as u32;
-        let tile_bits = u32::BITS - view.tiles().leading_zeros();
-        self.view.write(&self.gpu, 0, &[view]);
-        let visible = ScanSetup::known(view.gaussian_count, VISIBLE_COUNTER, view.gaussian_count);
-        self.visible_scan.write(&self.gpu, 0, &[visible]);
-        self.intersection_scan.write(
-            &self.gpu,
-            0,
-            &[ScanSetup::counted(VISIBLE_COUNTER, INTERSECTION_COUNTER, view.intersection_capacity)],
-        );
-        Ok(PreparedView { view, sorted: (tile_bits.div_ceil(8) % 2) as usize })
+        let uniform = self.uniforms.put(&view);
+        Ok(PreparedView { view, uniform, sorted: Self::sorted(view.tiles()), samples_tiles: false })
     }
 
-    /// Encodes what must precede the pass of [`Self::encode_forward`].
-    pub fn encode_clear(&self, encoder: &mut wgpu::CommandEncoder) {
-        encoder.clear_buffer(self.workspace.ranges.raw(), 0, None);
-        encoder.clear_buffer(self.workspace.unsampled.raw(), 0, None);
-        encoder.clear_buffer(self.workspace.counters.raw(), 0, None);
+    /// Which of `workspace.slots` holds the sorted intersections of a view of so many tiles.
+    pub(crate) fn sorted(tiles: u32) -> usize {
+        Sort::result_of(tile_bits(tiles))
     }
 
     /// Encodes the forward pass over a map's parameters or their averages.
     pub fn encode_forward(&self, pass: &mut wgpu::ComputePass<'_>, parameters: &GpuBuffer, prepared: &PreparedView) {
         let (gpu, ws, k) = (&*self.gpu, &self.workspace, &self.kernels);
-        let (view, uniform) = (&prepared.view, &self.view);
-        let count = view.gaussian_count;
-        let per_gaussian = workgroups(count.div_ceil(256));
-        let project = [(0, uniform), (1, parameters), (2, &ws.projected), (3, &ws.visible), (4, &ws.unsampled)];
+        let (view, uniform) = (&prepared.view, self.view(prepared));
+        let per_gaussian = workgroups(view.gaussian_count.div_ceil(256));
+        let project = [
+            (0, uniform),
+            (1, parameters),
+            (2, &ws.projected),
+            (3, &ws.visible),
+            (4, self.unsampled(prepared)),
+            (5, &ws.block_sums),
+        ];
         k.project_forward.dispatch(gpu, pass, &project, per_gaussian);
-        let job = ScanJob { setup: &self.visible_scan, values: &ws.visible, prefix: &ws.prefix, bound: count };
-        k.scan.encode(gpu, pass, ws, &job);
+        self.encode_scan(pass, prepared, &self.visible_scan);
         let compact = [
             (0, uniform),
             (1, &ws.visible),
-            (2, &ws.prefix),
+            (2, &ws.block_sums),
             (3, &ws.projected),
             (4, &ws.depth_keys[0]),
             (5, &ws.order[0]),
@@ -229,39 +233,43 @@ impl Rasterizer {
         k.rasterize_forward.dispatch(gpu, pass, &bindings, self.form.workgroups(view.tiles()));
     }
 
-    /// Tile lists: count, offsets, emit, stable sort by tile, ranges, order.
+    fn encode_scan(&self, pass: &mut wgpu::ComputePass<'_>, prepared: &PreparedView, setup: &GpuBuffer) {
+        let ws = &self.workspace;
+        let bindings = [(0, self.view(prepared)), (1, setup), (2, &ws.block_sums), (3, &ws.counters)];
+        self.kernels.scan_blocks.dispatch(&self.gpu, pass, &bindings, [1, 1, 1]);
+    }
+
+    /// Tile lists: count, offsets, emit, stable sort by tile, ranges; in the narrow form, order.
     fn encode_tiles(&self, pass: &mut wgpu::ComputePass<'_>, prepared: &PreparedView) {
         let (gpu, ws, k) = (&*self.gpu, &self.workspace, &self.kernels);
+        let (view, tiles) = (self.view(prepared), prepared.view.tiles());
         let visible = IndirectSize { buffer: &ws.counters, offset: Counter::per_element_offset(VISIBLE_COUNTER) };
         let lists = |mode| {
             [
-                (0, &self.view),
+                (0, view),
                 (1, mode),
                 (2, &ws.counters),
                 (3, &ws.order[0]),
                 (4, &ws.projected),
                 (5, &ws.intersection_counts),
-                (6, &ws.intersection_offsets),
+                (6, &ws.block_sums),
                 (7, &ws.tile_keys[0]),
                 (8, &ws.slots[0]),
                 (9, &ws.slot_gaussians),
-                (10, &ws.unsampled),
+                (10, self.unsampled(prepared)),
             ]
         };
         k.tile_lists.dispatch_indirect(gpu, pass, &lists(&self.count_mode), visible);
-        let bound = prepared.view.gaussian_count;
-        let job =
-            ScanJob { setup: &self.intersection_scan, values: &ws.intersection_counts, prefix: &ws.intersection_offsets, bound };
-        k.scan.encode(gpu, pass, ws, &job);
+        self.encode_scan(pass, prepared, &self.intersection_scan);
         k.tile_lists.dispatch_indirect(gpu, pass, &lists(&self.emit_mode), visible);
-        let tile_bits = u32::BITS - prepared.view.tiles().leading_zeros();
-        let by_tile = SortJob { keys: &ws.tile_keys, values: &ws.slots, counter: INTERSECTION_COUNTER, bits: tile_bits };
+        let by_tile = SortJob { keys: &ws.tile_keys, values: &ws.slots, counter: INTERSECTION_COUNTER, bits: tile_bits(tiles) };
         let sorted = k.sort.encode(gpu, pass, ws, &by_tile);
         debug_assert_eq!(sorted, prepared.sorted);
-        let ranges = [(0, &ws.counters), (1, &ws.tile_keys[sorted]), (2, &ws.ranges)];
-        let intersections = IndirectSize { buffer: &ws.counters, offset: Counter::per_element_offset(INTERSECTION_COUNTER) };
-        k.tile_ranges.dispatch_indirect(gpu, pass, &ranges, intersections);
-        k.order_tiles.dispatch(gpu, pass, &[(0, &self.view), (1, &ws.ranges)], [1, 1, 1]);
+        let ranges = [(0, view), (1, &ws.counters), (2, &ws.tile_keys[sorted]), (3, &ws.ranges)];
+        k.tile_ranges.dispatch(gpu, pass, &ranges, workgroups(tiles.div_ceil(256)));
+        if self.form == BlendForm::Narrow {
+            k.order_tiles.dispatch(gpu, pass, &[(0, view), (1, &ws.ranges)], [1, 1, 1]);
+        }
     }
 
     /// Reads the counters of the last view; when its intersections did not fit, grows the buffers and returns `None`: repeat the step.
@@ -303,20 +311,33 @@ impl Rasterizer {
         loop {
             let prepared = self.prepare(cloud, camera, background)?;
             let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
-            self.encode_clear(&mut encoder);
             self.encode_forward(&mut encoder.begin_compute_pass(&Default::default()), cloud.averages(), &prepared);
-            self.gpu.queue.submit([encoder.finish()]);
-            if self.finish()?.is_none() {
+            self.uniforms.upload(&self.gpu);
+            let (ws, pixels) = (&self.workspace, prepared.view.pixels() as usize);
+            let parts = [
+                ws.counters.part::<Counter>(0, COUNTERS as usize),
+                ws.color_depth.part::<[f32; 4]>(0, pixels),
+                ws.state.part::<[f32; 2]>(0, pixels),
+            ];
+            let read = self.gpu.read(Some(encoder), &parts)?;
+            let counters: Vec<Counter> = read.part(0);
+            let (color_depth, state) = (read.part(1), read.part::<[f32; 2]>(2));
+            drop(read);
+            if self.counts(&counters).is_none() {
+                self.reserve_for(&counters)?;
                 continue;
             }
-            let pixels = prepared.view.pixels() as usize;
-            let state: Vec<[f32; 2]> = self.workspace.state.read(&self.gpu, 0, pixels)?;
             return Ok(Rendered {
                 width: prepared.view.width,
                 height: prepared.view.height,
-                color_depth: self.workspace.color_depth.read(&self.gpu, 0, pixels)?,
+                color_depth,
                 transmittance: state.iter().map(|s| s[0]).collect(),
             });
         }
     }
+}
+
+/// Bits of the tiles' numbers.
+fn tile_bits(tiles: u32) -> u32 {
+    u32::BITS - tiles.leading_zeros()
 }

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::layout::{COUNTERS, Counter, SCAN_BLOCK, SORT_BLOCK, SORT_CHUNK};
+use super::layout::{COUNTERS, Counter, SORT_BLOCK, SORT_CHUNK};
 use crate::gpu::{Gpu, GpuBuffer, GpuError};
 
 /// Bytes of one intersection's gradient: three vec4.
@@ -18,14 +18,13 @@ pub(crate) struct Workspace {
     pub(crate) capacity: usize,
     pub(crate) projected: GpuBuffer,
     pub(super) visible: GpuBuffer,
-    pub(super) prefix: GpuBuffer,
+    /// Per workgroup of 256.
     pub(super) block_sums: GpuBuffer,
     pub(super) depth_keys: [GpuBuffer; 2],
     /// Visible Gaussians, nearest first, in `[0]` after the depth sort.
     pub(super) order: [GpuBuffer; 2],
     /// Per visible Gaussian its intersections, nearest first; then per Gaussian where its slots begin and end; then the visible ones in map order.
     pub(crate) intersection_counts: GpuBuffer,
-    pub(super) intersection_offsets: GpuBuffer,
     // Per intersection.
     pub(crate) intersection_capacity: usize,
     pub(super) tile_keys: [GpuBuffer; 2],
@@ -37,8 +36,9 @@ pub(crate) struct Workspace {
     pixels: u32,
     tiles: u32,
     pub(crate) ranges: GpuBuffer,
-    /// One bit a tile.
+    /// One bit a tile; zeros where all tiles are sampled.
     pub(crate) unsampled: GpuBuffer,
+    pub(crate) none_unsampled: GpuBuffer,
     pub(crate) color_depth: GpuBuffer,
     pub(crate) state: GpuBuffer,
 }
@@ -61,12 +61,10 @@ impl Workspace {
             capacity: 0,
             projected: empty("projected")?,
             visible: empty("visible")?,
-            prefix: empty("prefix")?,
             block_sums: empty("block sums")?,
             depth_keys: [empty("depth keys")?, empty("depth keys")?],
             order: [empty("order")?, empty("order")?],
             intersection_counts: empty("intersection counts")?,
-            intersection_offsets: empty("intersection offsets")?,
             intersection_capacity: 0,
             tile_keys: [empty("tile keys")?, empty("tile keys")?],
             slots: [empty("slots")?, empty("slots")?],
@@ -77,6 +75,7 @@ impl Workspace {
             tiles: 0,
             ranges: empty("ranges")?,
             unsampled: GpuBuffer::computed_uniform(gpu, "unsampled tiles", UNSAMPLED_MASK_BYTES)?,
+            none_unsampled: GpuBuffer::computed_uniform(gpu, "no unsampled tiles", UNSAMPLED_MASK_BYTES)?,
             color_depth: empty("rendered")?,
             state: empty("rendered state")?,
         };
@@ -103,12 +102,10 @@ impl Workspace {
         let words = |label: &str| GpuBuffer::storage(gpu, label, capacity as u64 * 4);
         self.projected = GpuBuffer::storage(gpu, "projected", capacity as u64 * 48)?;
         self.visible = words("visible")?;
-        self.prefix = words("prefix")?;
-        self.block_sums = GpuBuffer::storage(gpu, "block sums", (capacity as u64).div_ceil(u64::from(SCAN_BLOCK)) * 4)?;
+        self.block_sums = GpuBuffer::storage(gpu, "block sums", (capacity as u64).div_ceil(256) * 4)?;
         self.depth_keys = [words("depth keys")?, words("depth keys")?];
         self.order = [words("order")?, words("order")?];
         self.intersection_counts = GpuBuffer::storage(gpu, "intersection counts", capacity as u64 * 16)?;
-        self.intersection_offsets = words("intersection offsets")?;
         self.capacity = capacity;
         self.reserve_histogram(gpu)
     }

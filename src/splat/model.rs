@@ -24,6 +24,15 @@ pub const MIN_QUATERNION_NORM_SQUARED: f64 = 1e-8;
 /// How far beyond the image's edge, as a share of its size, the Jacobian follows x/z and y/z.
 pub const TANGENT_MARGIN: f64 = 0.15;
 
+/// Bits of a depth, as f32, that one step of [`depth_key`] spans.
+pub const DEPTH_KEY_STEP: u32 = ((FAR_METRES as f32).to_bits() - (NEAR_METRES as f32).to_bits()).div_ceil(1 << 16);
+
+/// Sixteen bits by which Gaussians are sorted, of a depth between [`NEAR_METRES`] and [`FAR_METRES`]: the bits of positive floats grow with
+/// them. Equal keys keep the order of the map; their depths differ by less than 1 in 3,000.
+pub fn depth_key(depth: f32) -> u32 {
+    (depth.to_bits() - (NEAR_METRES as f32).to_bits()) / DEPTH_KEY_STEP
+}
+
 /// A camera to render from.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ViewCamera {

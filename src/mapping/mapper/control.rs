@@ -3,7 +3,7 @@
 use super::{Mapper, Step};
 use crate::mapping::density::{self, Candidate};
 use crate::mapping::{DensityConfig, DensityStrategy, MappingError};
-use crate::optimise::{AdamConfig, ErrorPixels, GaussianScore};
+use crate::optimise::{ErrorPixels, GaussianScore};
 
 impl Mapper {
     /// Whether, and by what, Gaussians are scored: for control of their density, or to know which to give up.
@@ -37,18 +37,11 @@ impl Mapper {
         Ok((before - plan.keep.len() - children / 2, children / 2))
     }
 
-    /// A last step of each of some keyframes of the window, evenly spread over it, that scores the Gaussians; returns their number.
-    pub(super) fn score(&mut self, window: &[usize], density: &DensityConfig, adam: &AdamConfig) -> Result<usize, MappingError> {
-        let Some(error_pixels) = self.scoring(density) else { return Ok(0) };
-        self.trainer.begin_scores(&self.cloud)?;
+    /// A step of each of some keyframes of the window, evenly spread over it, that scores the Gaussians.
+    pub(super) fn scoring_steps(&self, window: &[usize], density: &DensityConfig) -> Vec<Step> {
         let views = density.views.min(window.len());
-        let chosen: Vec<Step> = (0..views)
-            .map(|k| Step {
-                keyframe: window[k * window.len() / views],
-                coarse: false,
-                lr_scale: self.config.window.final_lr_scale,
-            })
-            .collect();
-        Ok(self.steps(&chosen, Some(error_pixels), self.tile_sampling(), adam)?.len())
+        let scored = self.scoring(density);
+        let step = |k: usize| Step { scored, ..Step::new(window[k * window.len() / views]) };
+        (0..scored.map_or(0, |_| views)).map(step).collect()
     }
 }

@@ -8,9 +8,9 @@ use std::time::Instant;
 use serde::{Deserialize, Serialize};
 
 use crate::mapping::{DensityConfig, MappingError, RefineConfig};
-use crate::optimise::{AdamConfig, StepReport};
+use crate::optimise::AdamConfig;
 
-use super::{BATCH, Mapper, Step};
+use super::{BATCH, Mapper, Step, Taken};
 
 /// Share of the steps after which nothing is pruned: neighbours take some epochs to fill the place of a Gaussian.
 const LAST_CONTROL: f32 = 0.8;
@@ -67,19 +67,19 @@ impl FinalRefinement {
 }
 
 impl Mapper {
-    /// Takes the online steps that follow a keyframe, until `stop`; where steps yield to keyframes, without end. Returns their number.
+    /// Takes the online steps that follow a keyframe, until `stop`; where steps yield to keyframes, without end.
     ///
     /// # Errors
     /// [`MappingError`] if a buffer does not fit or the device fails.
-    pub(super) fn consolidate(&mut self, stop: &dyn Fn() -> bool) -> Result<usize, MappingError> {
+    pub(super) fn consolidate(&mut self, stop: &dyn Fn() -> bool) -> Result<Taken, MappingError> {
         let config = self.config.clone();
         let steps = if config.yields_to_keyframes { usize::MAX } else { config.refine.steps_per_keyframe };
-        let mut done = 0;
-        while done < steps && !self.cloud.is_empty() && !stop() {
-            let batch = self.draw(self.batch().min(steps - done), false);
-            done += self.consolidation_steps(&batch, &config.adam)?.len();
+        let mut taken = Taken::default();
+        while taken.steps < steps && !self.cloud.is_empty() && !stop() {
+            let batch = self.draw(self.batch().min(steps - taken.steps), false);
+            taken += self.consolidation_steps(&batch, &config.adam)?;
         }
-        Ok(done)
+        Ok(taken)
     }
 
     /// So many steps of the running epoch.
@@ -91,7 +91,7 @@ impl Mapper {
             }
             self.epoch.pop()
         };
-        (0..count).filter_map(|_| next()).map(|keyframe| Step { keyframe, coarse, lr_scale: 1.0 }).collect()
+        (0..count).filter_map(|_| next()).map(|keyframe| Step { coarse, ..Step::new(keyframe) }).collect()
     }
 
     /// All keyframes, ascending.
@@ -99,9 +99,9 @@ impl Mapper {
         (0..self.keyframes.len()).collect()
     }
 
-    fn consolidation_steps(&mut self, batch: &[Step], adam: &AdamConfig) -> Result<Vec<StepReport>, MappingError> {
+    fn consolidation_steps(&mut self, batch: &[Step], adam: &AdamConfig) -> Result<Taken, MappingError> {
         let sampling = if self.config.refine.all_tiles { None } else { self.tile_sampling() };
-        self.steps(batch, None, sampling, adam)
+        self.steps(batch, sampling, adam)
     }
 
     /// Begins a refinement, and with it an epoch, over the keyframes so far; none may come until it is done.
@@ -135,22 +135,20 @@ impl Mapper {
         let density = DensityConfig { views: refinement.config.density_views, ..self.config.density.clone() };
         let density = if refinement.progress() >= growth_share { density.without_growth() } else { density };
         let mut adam = refinement.rates();
-        let mut psnr = (0.0, 0);
+        let mut taken = Taken::default();
         let end = steps.min(refinement.done + density_every);
         while refinement.done < end && !refinement.is_done() && !stop() {
             let coarse = refinement.progress() < half_size_share;
             let batch = self.draw(BATCH.min(end - refinement.done), coarse);
             adam = refinement.rates();
-            for report in self.consolidation_steps(&batch, &adam)? {
-                psnr = (psnr.0 + report.loss.psnr_db(), psnr.1 + 1);
-            }
+            taken += self.consolidation_steps(&batch, &adam)?;
             refinement.done += batch.len();
         }
         self.refine_exposures(refinement)?;
         let is_controlled = refinement.progress() < LAST_CONTROL;
         let (pruned, grown) = if is_controlled { self.score_and_control(refinement, &density, &adam)? } else { (0, 0) };
-        let psnr_db = psnr.0 / psnr.1.max(1) as f32;
-        Ok(Some(RefineReport { steps_done: refinement.done, pruned, grown, gaussians: self.cloud.len(), psnr_db }))
+        let (gaussians, psnr_db) = (self.cloud.len(), taken.psnr_db());
+        Ok(Some(RefineReport { steps_done: refinement.done, pruned, grown, gaussians, psnr_db }))
     }
 
     /// Density control by views spread over all keyframes, others in each round.
@@ -164,7 +162,9 @@ impl Mapper {
         let count = views.len();
         views.rotate_left(refinement.rounds % count);
         refinement.rounds += 1;
-        refinement.done += self.score(&views, density, adam)?;
+        let steps = self.scoring_steps(&views, density);
+        self.trainer.begin_scores(&self.cloud)?;
+        refinement.done += self.take(&steps, adam, &|| false)?.steps;
         self.stats.keyframe_mapped();
         self.control_density(density)
     }

@@ -30,8 +30,10 @@ impl GpuCloud {
         let span = first.run.start..last.run.end;
         for buffer in [&self.parameters, &self.averages] {
             let place = |plane: usize| plane * self.capacity + span.start;
-            let read = |plane: usize| buffer.read(gpu, place(plane), span.len());
-            let mut planes = (0..self.planes()).map(read).collect::<Result<Vec<Vec<[f32; 4]>>, _>>()?;
+            let parts: Vec<_> = (0..self.planes()).map(|plane| buffer.part::<[f32; 4]>(place(plane), span.len())).collect();
+            let read = gpu.read(None, &parts)?;
+            let mut planes: Vec<Vec<[f32; 4]>> = (0..self.planes()).map(|plane| read.part(plane)).collect();
+            drop(read);
             for RunMotion { run, new_from_old } in motions {
                 let run = run.start - span.start..run.end - span.start;
                 move_geometry(&mut planes, run.clone(), new_from_old);
@@ -48,7 +50,7 @@ impl GpuCloud {
                 }
             }
         }
-        gpu.queue.submit([encoder.finish()]);
+        gpu.submit(encoder);
         Ok(())
     }
 }

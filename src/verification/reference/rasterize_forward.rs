@@ -10,7 +10,7 @@ use crate::splat::model;
 pub fn sorted(view: &View64, cloud: &[Gaussian64]) -> Vec<(usize, Projected64)> {
     let mut visible: Vec<_> = cloud.iter().enumerate().filter_map(|(i, g)| Some((i, project(view, g)?))).collect();
     // The GPU's keys are f32.
-    visible.sort_by(|a, b| (a.1.depth as f32).total_cmp(&(b.1.depth as f32)));
+    visible.sort_by_key(|(_, projected)| model::depth_key(projected.depth as f32));
     visible
 }
 
