@@ -38,7 +38,7 @@ fn steps(criterion: &mut Criterion) {
                 let form = BlendForm::of(&gpu);
                 let runner = move |gpu| {
                     let scene = BenchScene::new(gpu, gaussians, (width, height), ShDegree::new(degree).expect("0 to 3"))?;
-                    StepRunner::new(gpu, scene, form, None)
+                    StepRunner::new(gpu, scene, form)
                 };
                 bench_scene(criterion, &name, || runner(&gpu));
             }

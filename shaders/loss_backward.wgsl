@@ -10,23 +10,13 @@
 @group(0) @binding(5) var<storage, read> partials: array<vec4<f32>>;
 // [2, H, W] plane 0 (r, g, b, Σ w z), plane 1 (alpha; mean |colour error|, for the scores; -, -).
 @group(0) @binding(6) var<storage, read_write> image_gradients: array<vec4<f32>>;
-@group(0) @binding(7) var<uniform> unsampled: UnsampledTiles;
 
 // (by mean, by square, by product) of one channel filtered along rows: [13 rows of windows, 16 columns].
 var<workgroup> rows: array<vec4<f32>, 208>;
 
-// A workgroup covers 16×16 pixels: two tiles, whose gradients are not needed if neither is sampled.
+// A workgroup covers 16×16 pixels.
 @compute @workgroup_size(64)
-fn main(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) local: u32,
-) {
-    let tile = 2u * workgroup.y * workgroups.x + workgroup.x;
-    let below = select(tile, tile + workgroups.x, workgroup.y * 16u + 8u < setup.height);
-    if is_bit_set(unsampled.bits[tile / 128u % 1024u], tile) && is_bit_set(unsampled.bits[below / 128u % 1024u], below) {
-        return;
-    }
+fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_index) local: u32) {
     // Four pixels of one column.
     let column = local % 16u;
     let row = local / 16u * 4u;

@@ -10,9 +10,8 @@
 @group(0) @binding(4) var<storage, read> target_depth: array<f32>;
 // [3 channels, bordered windows along y, along x] ∂SSIM/∂(mean, mean square, mean product), zero where there is no window.
 @group(0) @binding(5) var<storage, read_write> partials: array<vec4<f32>>;
-// [tiles] sums of |colour error|, SSIM, |depth error|, squared colour error; a tile left out keeps those it had.
+// [tiles] sums of |colour error|, SSIM, |depth error|, squared colour error.
 @group(0) @binding(6) var<storage, read_write> loss_sums: array<vec4<f32>>;
-@group(0) @binding(7) var<uniform> unsampled: UnsampledTiles;
 
 const C1: f32 = 0.0001;
 const C2: f32 = 0.0009;
@@ -28,8 +27,8 @@ struct Ssim {
     by_product: vec3<f32>,
 }
 
-// A workgroup covers a tile, 16×8 pixels, and an invocation one window and four pixels. Windows of a tile that is left out do not count, and
-// those at pixels that were not recorded are perfect. Such pixels are zero in both images, as those beyond the border are.
+// A workgroup covers a tile, 16×8 pixels, and an invocation one window and four pixels. Windows at pixels that were
+// not recorded are perfect. Such pixels are zero in both images, as those beyond the border are.
 @compute @workgroup_size(32)
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
@@ -42,12 +41,6 @@ fn main(
     let stride = bordered_windows(setup.width);
     let plane = stride * bordered_windows(setup.height);
     let to = (first.y / 2u + window.y + WINDOW_BORDER) * stride + first.x / 2u + window.x + WINDOW_BORDER;
-    if is_bit_set(unsampled.bits[tile / 128u % 1024u], tile) {
-        partials[to] = vec4(0.0);
-        partials[plane + to] = vec4(0.0);
-        partials[2u * plane + to] = vec4(0.0);
-        return;
-    }
     for (var item = local; item < 34u; item += 32u) {
         filter_row(first, item / 2u, item % 2u * 4u);
     }

@@ -9,9 +9,8 @@
 @group(0) @binding(2) var<storage, read_write> projected: array<vec4<f32>>;
 // [N] 1 where the Gaussian may touch the image.
 @group(0) @binding(3) var<storage, read_write> visible: array<u32>;
-@group(0) @binding(4) var<uniform> unsampled: UnsampledTiles;
 // [N / 256] visible Gaussians of each workgroup.
-@group(0) @binding(5) var<storage, read_write> block_sums: array<u32>;
+@group(0) @binding(4) var<storage, read_write> block_sums: array<u32>;
 
 var<workgroup> visible_here: atomic<u32>;
 
@@ -63,7 +62,7 @@ fn project(i: u32) -> bool {
     let cut = log(opacity / ALPHA_MIN);
     let half_extent = sqrt(2.0 * cut * c.xz);
     let inside = (mean + half_extent >= vec2(-0.5)) & (mean - half_extent <= vec2(f32(view.width), f32(view.height)) - 0.5);
-    if !all(inside) || !reaches_tile(mean, half_extent * EXTENT_SLACK) {
+    if !all(inside) {
         return false;
     }
     let seen = color(i, mean_opacity.xyz);
@@ -74,26 +73,6 @@ fn project(i: u32) -> bool {
     projected[3u * i + 1u] = vec4(conic_factor(projection), opacity);
     projected[3u * i + 2u] = vec4(seen, bitcast<f32>(pack2x16float(min(half_extent * EXTENT_SLACK, vec2(MAX_EXTENT)))));
     return true;
-}
-
-// Whether the rectangle touches a tile that is not left out. Large rectangles are taken to.
-fn reaches_tile(mean: vec2<f32>, half_extent: vec2<f32>) -> bool {
-    let last_tile = vec2(f32(view.tiles_x), f32(view.tiles_y)) - 1.0;
-    let tile_size = vec2(f32(TILE_WIDTH), f32(TILE_HEIGHT));
-    let low = vec2<u32>(clamp(floor((mean - half_extent) / tile_size), vec2(0.0), last_tile));
-    let high = vec2<u32>(clamp(floor((mean + half_extent) / tile_size), vec2(0.0), last_tile));
-    if any(high - low > vec2(3u)) {
-        return true;
-    }
-    for (var y = low.y; y <= high.y; y++) {
-        for (var x = low.x; x <= high.x; x++) {
-            let tile = y * view.tiles_x + x;
-            if !is_bit_set(unsampled.bits[tile / 128u % 1024u], tile) {
-                return true;
-            }
-        }
-    }
-    return false;
 }
 
 fn color(i: u32, mean: vec3<f32>) -> vec3<f32> {

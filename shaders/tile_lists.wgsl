@@ -23,7 +23,6 @@ struct TileListsSetup {
 @group(0) @binding(8) var<storage, read_write> slots: array<u32>;
 // [intersections] Gaussian of each slot.
 @group(0) @binding(9) var<storage, read_write> slot_gaussians: array<u32>;
-@group(0) @binding(10) var<uniform> unsampled: UnsampledTiles;
 
 // Slack for rounding, absolute and relative: a tile too many costs time, one too few a seam.
 const SLACK: f32 = 1e-3;
@@ -71,9 +70,6 @@ fn list(rank: u32, emit: bool, slot: u32) -> u32 {
     for (var y = low.y; y <= high.y; y++) {
         for (var x = low.x; x <= high.x; x++) {
             let tile = y * view.tiles_x + x;
-            if is_bit_set(unsampled.bits[tile / 128u % 1024u], tile) {
-                continue;
-            }
             if !touches(mean, conic_factor, limit, vec2(f32(x), f32(y)) * tile_size, tile_size - 1.0) {
                 continue;
             }

@@ -137,7 +137,7 @@ pub enum ConfigError {
 }
 
 /// Dotted keys of earlier versions, and those that replaced them; keys of a section before the section itself.
-const RENAMED: [(&str, &str); 20] = [
+const RENAMED: [(&str, &str); 17] = [
     ("mapping.limits.max_keyframes", "mapping.limits.max_gpu_images"),
     ("mapping.density.vcd.min_worth", "mapping.density.multi_view.min_contribution"),
     ("mapping.density.vcd.wrong_pixels", "mapping.density.multi_view.error_pixels"),
@@ -153,9 +153,6 @@ const RENAMED: [(&str, &str); 20] = [
     ("mapping.refine.final_position_rate", "mapping.refine.final_lr_scale_position"),
     ("mapping.refine.final_rate", "mapping.refine.final_lr_scale"),
     ("mapping.plane_sweep.trust", "mapping.plane_sweep.depth_confidence"),
-    ("mapping.skip.tile_share", "mapping.tile_sampling.share"),
-    ("mapping.skip.tile_least", "mapping.tile_sampling.min_share"),
-    ("mapping.skip.tile_noise", "mapping.tile_sampling.noise"),
     ("replay.paced", "replay.real_time"),
     ("mapping.seeding", "mapping.insertion"),
 ];

@@ -54,8 +54,6 @@ impl Preset {
                 // before the steps, so that no keyframe waits for it.
                 mapping.density.every = 5;
                 mapping.density.after_share = 0.0;
-                // In so few steps a tile that is left out once is hardly sampled again.
-                mapping.tile_sampling.min_share = 1.0;
             }
             Self::Draft => {
                 // With so few steps a keyframe's own are best kept for the end.
@@ -134,7 +132,7 @@ pub fn realtime_scale(gpu: &Arc<Gpu>, recording: &Recording) -> Result<f64, GpuE
         let size = (pinhole.width, pinhole.height);
         let gaussians = (size.0 * size.1 / PIXELS_PER_GAUSSIAN) as usize;
         let scene = BenchScene::new(gpu, gaussians, size, recording.config().mapping.sh_degree)?;
-        let wall = StepRunner::new(gpu, scene, BlendForm::of(gpu), None)?.run()?.wall;
+        let wall = StepRunner::new(gpu, scene, BlendForm::of(gpu))?.run()?.wall;
         tracing::info!(scale, step_ms = wall.as_secs_f64() * 1e3, "training step measured");
         if wall <= LONGEST_STEP {
             break;

@@ -10,7 +10,7 @@ use super::rates::Rates;
 use super::scene::BenchScene;
 use super::work::{Work, count_work};
 use crate::gpu::{Gpu, GpuError};
-use crate::optimise::{AdamConfig, LossConfig, TileSampling, Trainer, TrainingView};
+use crate::optimise::{AdamConfig, LossConfig, Trainer, TrainingView};
 use crate::render::BlendForm;
 use crate::splat::ShDegree;
 
@@ -27,8 +27,6 @@ pub struct StepBench {
     pub sh_degree: ShDegree,
     /// Form of the blending passes.
     pub form: BlendForm,
-    /// Tile sampling of the steps; `None`: all tiles.
-    pub tile_sampling: Option<TileSampling>,
     /// Timed steps; a few untimed ones precede them.
     pub steps: usize,
 }
@@ -74,7 +72,6 @@ pub struct StepRunner {
     scene: BenchScene,
     trainer: Trainer,
     still: AdamConfig,
-    tile_sampling: Option<TileSampling>,
     /// The work in one step.
     pub work: Work,
 }
@@ -95,17 +92,12 @@ impl StepRunner {
     ///
     /// # Errors
     /// [`GpuError`] if a buffer does not fit or the device fails.
-    pub fn new(
-        gpu: &Arc<Gpu>,
-        scene: BenchScene,
-        form: BlendForm,
-        tile_sampling: Option<TileSampling>,
-    ) -> Result<Self, GpuError> {
+    pub fn new(gpu: &Arc<Gpu>, scene: BenchScene, form: BlendForm) -> Result<Self, GpuError> {
         let mut trainer = Trainer::with_form(gpu.clone(), form)?;
         let work = count_work(&mut trainer, &scene.cloud, &scene.camera)?;
         // Rates of zero keep the scene as it is, step after step, at the same cost.
         let still = AdamConfig::default().scaled(0.0, 0.0);
-        let mut runner = Self { gpu: gpu.clone(), scene, trainer, still, tile_sampling, work };
+        let mut runner = Self { gpu: gpu.clone(), scene, trainer, still, work };
         for _ in 0..WARM_UP {
             runner.steps(1)?;
         }
@@ -114,8 +106,7 @@ impl StepRunner {
     }
 
     fn steps(&mut self, count: usize) -> Result<(), GpuError> {
-        let (camera, target, tile_sampling) = (self.scene.camera, &self.scene.target, self.tile_sampling);
-        let views = [TrainingView { tile_sampling, ..TrainingView::new(camera, target) }; BATCH];
+        let views = [TrainingView::new(self.scene.camera, &self.scene.target); BATCH];
         self.trainer.steps(&self.scene.cloud, &views[..count], &LossConfig::default(), &self.still)?;
         Ok(())
     }
@@ -145,7 +136,7 @@ impl StepRunner {
 /// # Errors
 /// [`GpuError`] if a buffer does not fit or the device fails.
 pub fn bench_step(gpu: &Arc<Gpu>, scene: BenchScene, bench: &StepBench, rates: &Rates) -> Result<StepReport, GpuError> {
-    let mut runner = StepRunner::new(gpu, scene, bench.form, bench.tile_sampling)?;
+    let mut runner = StepRunner::new(gpu, scene, bench.form)?;
     let times = (0..bench.steps.div_ceil(BATCH)).map(|_| runner.run()).collect::<Result<Vec<_>, _>>()?;
     let ms = |part: &dyn Fn(&StepTimes) -> Duration| {
         let mut all: Vec<f64> = times.iter().map(|t| part(t).as_secs_f64() * 1e3).collect();

@@ -9,7 +9,6 @@ use clap::{Args, Subcommand, ValueEnum};
 use keysplat::calibration::{BenchScene, Rates, StepBench, StepReport, bench_step, measure_rates};
 use keysplat::geometry::{Pinhole, Se3, Trajectory};
 use keysplat::gpu::{AdapterSummary, Gpu, GpuError};
-use keysplat::optimise::TileSampling;
 use keysplat::render::BlendForm;
 use keysplat::run_folder::outputs;
 use keysplat::sequence::{RectifiedImage, Rectifier};
@@ -55,9 +54,6 @@ struct StepArgs {
     /// Form of the blending passes: the adapter's own by default.
     #[arg(long, value_enum)]
     form: Option<Form>,
-    /// Sample tiles as `mapping.tile_sampling.share` does, with a least share of a tenth.
-    #[arg(long)]
-    tile_share: Option<f32>,
     /// Timed steps per scene.
     #[arg(long, default_value_t = 12)]
     steps: usize,
@@ -130,11 +126,9 @@ fn empty_report(gpu: &Gpu, rates: Rates) -> Report {
 fn step(args: &StepArgs) -> miette::Result<()> {
     let gpu = Gpu::open_profiled(args.adapter.as_deref()).into_diagnostic()?;
     let rates = measure_rates(&gpu).into_diagnostic()?;
-    let tile_sampling = args.tile_share.map(|share| TileSampling { share, min_share: 0.1, noise: 0.0 });
     let form = args.form.map_or(BlendForm::of(&gpu), BlendForm::from);
     let steps = args.steps;
-    let config =
-        |gaussians, width, height, sh_degree| StepBench { gaussians, width, height, sh_degree, form, tile_sampling, steps };
+    let config = |gaussians, width, height, sh_degree| StepBench { gaussians, width, height, sh_degree, form, steps };
     let mut report = empty_report(&gpu, rates);
     if !args.json {
         println!("{} [{}, {}]", gpu.adapter.name, gpu.adapter.kind, gpu.adapter.driver);

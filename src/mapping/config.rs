@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::{DensityConfig, ExposureConfig, LimitsConfig, PlaneSweepConfig};
-use crate::optimise::{AdamConfig, LossConfig, TileSampling};
+use crate::optimise::{AdamConfig, LossConfig};
 use crate::splat::ShDegree;
 
 /// The mapper's configuration.
@@ -23,8 +23,6 @@ pub struct MappingConfig {
     pub seed: u64,
     /// Keyframes that a step may draw.
     pub window: WindowConfig,
-    /// Tiles of a view that a step uses.
-    pub tile_sampling: TileSamplingConfig,
     /// Bounds on Gaussians, memory and keyframes.
     pub limits: LimitsConfig,
     /// Correction of exposure and white balance.
@@ -54,7 +52,6 @@ impl Default for MappingConfig {
             yields_to_keyframes: false,
             seed: 0,
             window: WindowConfig::default(),
-            tile_sampling: TileSamplingConfig::default(),
             limits: LimitsConfig::default(),
             exposure: ExposureConfig::default(),
             insertion: InsertionConfig::default(),
@@ -83,41 +80,6 @@ pub struct WindowConfig {
 impl Default for WindowConfig {
     fn default() -> Self {
         Self { recent: 6, covisible: 3, older_share: 0.6 }
-    }
-}
-
-/// Stochastic tile sampling: which tiles of a view a step uses.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct TileSamplingConfig {
-    /// Share of a view's steps that sample a tile of mean loss; other tiles in proportion to their loss.
-    pub share: f32,
-    /// Least share of the steps that sample a tile; 1: every step uses all tiles.
-    pub min_share: f32,
-    /// Loss per pixel below which a tile is sampled in no more than the least share.
-    pub noise: f32,
-}
-
-impl TileSamplingConfig {
-    /// Checks every value.
-    fn validate(&self) -> Result<(), String> {
-        let positive = |value: f32| value.is_finite() && value > 0.0;
-        if !(0.0..=1.0).contains(&self.min_share) || !positive(self.share) || !(positive(self.noise) || self.noise == 0.0) {
-            return Err("min_share must lie between 0 and 1, share must be positive, and noise zero or more".into());
-        }
-        Ok(())
-    }
-
-    /// The sampling of each step; `None` if steps use all tiles.
-    pub fn sampling(&self) -> Option<TileSampling> {
-        let Self { share, min_share, noise } = *self;
-        (min_share < 1.0).then_some(TileSampling { share, min_share, noise })
-    }
-}
-
-impl Default for TileSamplingConfig {
-    fn default() -> Self {
-        Self { share: 0.7, min_share: 0.1, noise: 0.0 }
     }
 }
 
@@ -201,8 +163,6 @@ pub struct RefineConfig {
     /// Wall-clock time after the last keyframe, seconds: replaces the number of steps. Such a run does not repeat.
     // Checkpoints hold this struct in postcard, where no field may be left out.
     pub seconds: Option<f64>,
-    /// Whether steps of consolidation use all tiles instead of sampling them.
-    pub all_tiles: bool,
     /// Density is controlled each time after so many steps,
     pub density_every: usize,
     /// by the scores of so many keyframes, evenly spread over all.
@@ -237,7 +197,6 @@ impl Default for RefineConfig {
             final_epochs: 15,
             steps: 0,
             seconds: None,
-            all_tiles: true,
             density_every: 200,
             density_views: 10,
             growth_share: 0.65,
@@ -251,14 +210,8 @@ impl Default for RefineConfig {
 impl MappingConfig {
     /// For recordings whose poses are known: keyframes only arrive, and the refinement makes the map.
     pub fn offline() -> Self {
-        let refine = RefineConfig {
-            steps_per_keyframe: 0,
-            final_epochs: 0,
-            steps: 6000,
-            all_tiles: false,
-            half_size_share: 0.3,
-            ..RefineConfig::default()
-        };
+        let refine =
+            RefineConfig { steps_per_keyframe: 0, final_epochs: 0, steps: 6000, half_size_share: 0.3, ..RefineConfig::default() };
         // Thousands of steps need lower rates, except for positions: points and inserted Gaussians lie further from where they belong than those
         // of a depth image do. The rates fall by themselves, which leaves averages nothing but to lag behind.
         let rates = AdamConfig { lr_position: 0.24, lr_harmonics: 0.015, ..AdamConfig::default() }.scaled(2.0 / 3.0, 2.0 / 3.0);
@@ -344,7 +297,6 @@ impl MappingConfig {
             return Err(format!("mapping.{name} must lie between 0 and 1, not {value}"));
         }
         self.refine.validate().map_err(|e| format!("mapping.refine: {e}"))?;
-        self.tile_sampling.validate().map_err(|e| format!("mapping.tile_sampling: {e}"))?;
         self.exposure.validate().map_err(|e| format!("mapping.exposure: {e}"))?;
         self.plane_sweep.validate().map_err(|e| format!("mapping.plane_sweep: {e}"))?;
         self.density.validate().map_err(|e| format!("mapping.density: {e}"))?;

@@ -16,7 +16,7 @@ use crate::gpu::{Gpu, GpuError, plain};
 use crate::optimise::{Pixels, TrainingView};
 use crate::sequence::{DepthImage, RectifiedImage};
 use crate::splat::{Exposure, ViewCamera};
-use images::{Images, TileLosses, halved_pinhole};
+use images::{Images, halved_pinhole};
 
 /// A keyframe from the tracker.
 #[derive(Clone, Debug)]
@@ -99,7 +99,6 @@ pub(super) struct KeyframeState {
     scale_since_anchor: f64,
     exposure: Exposure,
     covisible: Vec<KeyframeId>,
-    tile_losses: TileLosses,
     is_resident: bool,
     /// Depth that was swept for, `[H, W]`: it depends on what the other poses were then. Nothing where the recording has it.
     swept: Option<Swept>,
@@ -136,7 +135,6 @@ impl MappedKeyframe {
             scale_since_anchor: self.scale_since_anchor,
             exposure: self.exposure,
             covisible: self.covisible.clone(),
-            tile_losses: self.image.tile_losses(gpu)?,
             is_resident: self.is_resident(),
             swept: self.gray.is_some().then(swept).transpose()?,
         })
@@ -160,9 +158,6 @@ impl MappedKeyframe {
         }
         let image = &*image;
         let images = Images::new(gpu, image, with_half)?;
-        if !images.set_tile_losses(gpu, &state.tile_losses) {
-            return Ok(None);
-        }
         let mut restored = Self {
             id: state.id,
             camera: state.camera,

@@ -25,7 +25,7 @@ use super::schedule::{self, Step};
 use super::{Keyframe, KeyframeId, MappingConfig, MappingError, PoseUpdate, exposure, initialise_from_points};
 use crate::geometry::Se3;
 use crate::gpu::Gpu;
-use crate::optimise::{AdamConfig, TileSampling, Trainer, TrainingView};
+use crate::optimise::{AdamConfig, ScoredMap, Trainer, TrainingView};
 use crate::render::{GpuCloud, Rendered};
 use crate::sequence::{KnownPoint, RectifiedImage};
 use crate::splat::{Exposure, GaussianCloud, ViewCamera};
@@ -245,9 +245,11 @@ impl Mapper {
         scoring.truncate(iterations);
         let unscored = iterations - scoring.len();
         let mut before = schedule::steps(&window, self.keyframes.len(), unscored, &mut self.rng, &config.window);
-        let after = before.split_off((density.after_share * unscored as f32).round() as usize);
-        // Together where they are one batch: whatever waits for the GPU waits once.
-        if before.len() + scoring.len() <= self.batch() {
+        let mut after = before.split_off((density.after_share * unscored as f32).round() as usize);
+        // Together where they are one batch: the host waits once.
+        if !controlled {
+            after.splice(..0, before.drain(..));
+        } else if before.len() + scoring.len() <= self.batch() {
             scoring.splice(..0, before.drain(..));
         }
         let mut taken = self.take(&before, &config.adam, stop)?;
@@ -256,11 +258,14 @@ impl Mapper {
         }
         taken += self.take(&scoring, &config.adam, &|| false)?;
         self.stats.keyframe_mapped();
-        let (pruned, grown) = if controlled { self.control_density(density)? } else { (0, 0) };
-        taken += self.take(&after, &config.adam, stop)?;
-        let psnr_db = taken.psnr_db();
-        taken += self.consolidate(stop)?;
-        Ok(KeyframeReport { pruned, grown, iterations: taken.steps, psnr_db, ..KeyframeReport::default() })
+        let (pruned, grown) = if controlled { self.control_density(taken.scored.take(), density)? } else { (0, 0) };
+        let rest = self.with_consolidation(after);
+        taken += self.take(&rest, &config.adam, stop)?;
+        if config.yields_to_keyframes {
+            taken += self.consolidate_until(stop)?;
+        }
+        let (iterations, psnr_db) = (taken.steps, taken.psnr_db());
+        Ok(KeyframeReport { pruned, grown, iterations, psnr_db, ..KeyframeReport::default() })
     }
 
     /// Takes steps, in batches, until `stop`.
@@ -270,7 +275,7 @@ impl Mapper {
             if stop() {
                 break;
             }
-            taken += self.steps(batch, self.tile_sampling(), adam)?;
+            taken += self.steps(batch, adam)?;
         }
         Ok(taken)
     }
@@ -280,25 +285,20 @@ impl Mapper {
         if self.config.yields_to_keyframes { YIELDING_BATCH } else { BATCH }
     }
 
-    /// Tile sampling of online steps; `None` for all tiles.
-    fn tile_sampling(&self) -> Option<TileSampling> {
-        self.config.tile_sampling.sampling()
-    }
-
-    fn steps(&mut self, batch: &[Step], tile_sampling: Option<TileSampling>, adam: &AdamConfig) -> Result<Taken, MappingError> {
+    fn steps(&mut self, batch: &[Step], adam: &AdamConfig) -> Result<Taken, MappingError> {
         let streamed = batch.iter().map(|step| self.keyframes[step.keyframe].streamed(step.coarse, &self.images));
         let streamed = streamed.collect::<Result<Vec<_>, _>>()?;
         let views = batch.iter().zip(&streamed).map(|(step, pixels)| {
             let keyframe = &self.keyframes[step.keyframe];
             let view = keyframe.view(step.coarse);
             let depth_confidence = if keyframe.depth_is_estimated() { self.config.plane_sweep.depth_confidence } else { 1.0 };
-            TrainingView { streamed: pixels.as_deref(), depth_confidence, scored: step.scored, tile_sampling, ..view }
+            TrainingView { streamed: pixels.as_deref(), depth_confidence, scored: step.scored, ..view }
         });
         let views: Vec<TrainingView<'_>> = views.collect();
         let started = Instant::now();
-        let reports = self.trainer.steps(&self.cloud, &views, &self.config.loss, adam)?;
+        let (reports, scored) = self.trainer.steps_and_scores(&self.cloud, &views, &self.config.loss, adam)?;
         self.step_times.extend(std::iter::repeat_n(started.elapsed() / batch.len().max(1) as u32, batch.len()));
-        let mut taken = Taken { steps: batch.len(), psnr_sum: 0.0 };
+        let mut taken = Taken { steps: batch.len(), psnr_sum: 0.0, scored };
         for (step, report) in batch.iter().zip(&reports) {
             if !report.loss.total(&self.config.loss).is_finite() {
                 return Err(MappingError::NotFinite { id: self.keyframes[step.keyframe].id });
@@ -310,11 +310,13 @@ impl Mapper {
 }
 
 /// Steps taken.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Debug, Default)]
 struct Taken {
     steps: usize,
     /// Of the PSNR of each step's view before it.
     psnr_sum: f32,
+    /// After the last of them, if it was scored.
+    scored: Option<ScoredMap>,
 }
 
 impl Taken {
@@ -327,5 +329,6 @@ impl std::ops::AddAssign for Taken {
     fn add_assign(&mut self, more: Self) {
         self.steps += more.steps;
         self.psnr_sum += more.psnr_sum;
+        self.scored = more.scored;
     }
 }

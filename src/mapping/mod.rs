@@ -17,7 +17,7 @@ mod message;
 mod plane_sweep;
 mod schedule;
 
-pub use config::{InsertionConfig, MappingConfig, PointsConfig, RefineConfig, TileSamplingConfig, WindowConfig};
+pub use config::{InsertionConfig, MappingConfig, PointsConfig, RefineConfig, WindowConfig};
 pub use density::{ClassicConfig, DensityConfig, DensityStrategy, MultiViewConfig};
 pub use error::MappingError;
 pub use exposure::ExposureConfig;

@@ -104,8 +104,8 @@ impl AdamConfig {
         }
     }
 
-    /// The GPU's copy for step number `step` of the map, with all rates times `lr_scale`.
-    pub(super) fn setup(&self, step: usize, lr_scale: f32) -> AdamSetup {
+    /// The GPU's copy for step number `step` of the map.
+    pub(super) fn setup(&self, step: usize) -> AdamSetup {
         let p = self.lr_position;
         let rates = [
             [p, p, p, self.lr_opacity],
@@ -115,7 +115,6 @@ impl AdamConfig {
             [self.lr_color, self.lr_color, self.lr_color, 0.0],
             [self.lr_harmonics; 4],
         ];
-        let rates = rates.map(|lanes| lanes.map(|rate| rate * lr_scale));
         AdamSetup {
             rates,
             beta_1: self.beta_1,

@@ -1,6 +1,6 @@
 //! Buffers of the image loss, for each size of view in turn.
 
-use super::loss::{GpuPixels, Pixels, TargetBuffers, TargetImage};
+use super::loss::{GpuPixels, Pixels, TargetImage};
 use crate::gpu::{Gpu, GpuBuffer, GpuError};
 use crate::render::layout::{TILE_HEIGHT, TILE_WIDTH};
 
@@ -11,11 +11,6 @@ const WINDOW_BORDER: u32 = 3;
 /// Twin of the shaders' function: SSIM's windows along a side, with a border.
 fn bordered_windows(size: u32) -> u64 {
     u64::from(size.next_multiple_of(LOSS_TILE) / 2 + 2 * WINDOW_BORDER)
-}
-
-/// Tiles of an image, for which the loss is summed.
-pub(super) fn tiles((width, height): (u32, u32)) -> usize {
-    (width.div_ceil(TILE_WIDTH) * height.div_ceil(TILE_HEIGHT)) as usize
 }
 
 /// Sizes of view that the optimiser keeps buffers for: whole and half, of upright and of level photos. Photos may have any number of sizes.
@@ -29,15 +24,19 @@ pub(super) struct ImageBuffers {
     streamed: Option<GpuPixels>,
     pub partials: GpuBuffer,
     pub gradients: GpuBuffer,
+    /// [tiles]; its length is the number of terms that are summed.
+    pub loss_sums: GpuBuffer,
 }
 
 impl ImageBuffers {
     fn new(gpu: &Gpu, (width, height): (u32, u32)) -> Result<Self, GpuError> {
+        let tiles = width.div_ceil(TILE_WIDTH) * height.div_ceil(TILE_HEIGHT);
         Ok(Self {
             size: (width, height),
             streamed: None,
             partials: GpuBuffer::storage(gpu, "loss partials", bordered_windows(width) * bordered_windows(height) * 48)?,
             gradients: GpuBuffer::storage(gpu, "image gradients", u64::from(width * height) * 32)?,
+            loss_sums: GpuBuffer::storage(gpu, "loss sums", u64::from(tiles) * 16)?,
         })
     }
 
@@ -52,10 +51,9 @@ impl ImageBuffers {
         Ok(())
     }
 
-    /// The target of a step: its own buffers, or those that its pixels were streamed to.
-    pub fn target<'a>(&'a self, target: &'a TargetImage) -> TargetBuffers<'a> {
-        let pixels = target.pixels.as_ref().or(self.streamed.as_ref()).expect("a view brings an offloaded target along");
-        TargetBuffers { color: &pixels.color, depth: &pixels.depth, tile_losses: &target.tile_losses }
+    /// The pixels of a step's target: its own, or those that were streamed.
+    pub fn pixels<'a>(&'a self, target: &'a TargetImage) -> &'a GpuPixels {
+        target.pixels.as_ref().or(self.streamed.as_ref()).expect("a view brings an offloaded target along")
     }
 }
 

@@ -3,7 +3,6 @@
 use image::RgbImage;
 use serde::{Deserialize, Serialize};
 
-use super::image_buffers;
 use crate::gpu::{Gpu, GpuBuffer, GpuError};
 
 /// Weights of the image loss `(1-λ)·L1 + λ·(1-SSIM) + λ_depth·L1(depth)`.
@@ -114,15 +113,6 @@ impl GpuPixels {
     }
 }
 
-/// A step's target as the loss binds it.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct TargetBuffers<'a> {
-    pub color: &'a GpuBuffer,
-    pub depth: &'a GpuBuffer,
-    /// `[tiles]` sums of the loss; those of tiles left out stay from earlier steps.
-    pub tile_losses: &'a GpuBuffer,
-}
-
 /// What a view should look like: 8-bit colour and sensor depth, on the GPU unless offloaded.
 #[derive(Debug)]
 pub struct TargetImage {
@@ -132,8 +122,6 @@ pub struct TargetImage {
     pub height: u32,
     /// Nothing once offloaded.
     pub(super) pixels: Option<GpuPixels>,
-    /// [tiles] sums of the loss terms when each tile was last worked on, see `loss_forward.wgsl`.
-    pub(super) tile_losses: GpuBuffer,
 }
 
 impl TargetImage {
@@ -163,10 +151,7 @@ impl TargetImage {
             let measured: Vec<f32> = metres.iter().zip(&packed).map(|(m, color)| if *color == 0 { 0.0 } else { *m }).collect();
             pixels.depth.write(gpu, 0, &measured);
         }
-        let unknown = vec![[-1.0f32, 0.0, 0.0, 0.0]; image_buffers::tiles((width, height))];
-        let tile_losses = GpuBuffer::storage(gpu, "tile losses", unknown.len() as u64 * 16)?;
-        tile_losses.write(gpu, 0, &unknown);
-        Ok(Self { width, height, pixels: Some(pixels), tile_losses })
+        Ok(Self { width, height, pixels: Some(pixels) })
     }
 
     /// Whether its pixels are on the GPU.
@@ -195,22 +180,5 @@ impl TargetImage {
     /// Frees its pixels on the GPU: from here on a [`TrainingView`](super::TrainingView) brings them along.
     pub fn offload(&mut self) {
         self.pixels = None;
-    }
-
-    /// The losses of its tiles when each was last worked on, read back.
-    ///
-    /// # Errors
-    /// [`GpuError`] if a buffer does not fit or the device fails.
-    pub fn tile_losses(&self, gpu: &Gpu) -> Result<Vec<[f32; 4]>, GpuError> {
-        self.tile_losses.read(gpu, 0, image_buffers::tiles((self.width, self.height)))
-    }
-
-    /// Puts these in their place; says whether there are as many as tiles.
-    pub fn set_tile_losses(&self, gpu: &Gpu, losses: &[[f32; 4]]) -> bool {
-        let fits = losses.len() == image_buffers::tiles((self.width, self.height));
-        if fits {
-            self.tile_losses.write(gpu, 0, losses);
-        }
-        fits
     }
 }

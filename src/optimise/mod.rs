@@ -5,11 +5,9 @@ mod image_buffers;
 mod kernels;
 mod loss;
 mod scores;
-mod tile_sampling;
 mod trainer;
 
 pub use adam::AdamConfig;
 pub use loss::{LossConfig, LossTerms, Pixels, TargetImage, ssim_phase};
 pub use scores::{ErrorPixels, GaussianScore};
-pub use tile_sampling::TileSampling;
-pub use trainer::{Gradients, ImageGradients, StepReport, Trainer, TrainerState, TrainingView};
+pub use trainer::{Gradients, ImageGradients, ScoredMap, StepReport, Trainer, TrainerState, TrainingView};

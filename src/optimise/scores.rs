@@ -1,7 +1,7 @@
 //! Scores of the Gaussians over some views, for density control: computed beside a training step, from its own tile lists and gradients.
 
 use super::LossConfig;
-use crate::gpu::{Gpu, GpuBuffer, GpuError, IndirectSize, Kernel, UniformCell};
+use crate::gpu::{Gpu, GpuBuffer, GpuError, IndirectSize, Kernel, Part, ReadBack, UniformCell};
 use crate::render::layout::{Counter, ScoreSetup, VISIBLE_COUNTER};
 use crate::render::{GpuCloud, PreparedView, Rasterizer, shaders};
 
@@ -135,12 +135,17 @@ impl Scores {
         self.gather.dispatch_indirect(gpu, pass, &gather, visible);
     }
 
-    /// The sums over all views since the last clearing, `[N]` in map order.
-    pub fn read(&self, gpu: &Gpu, cloud: &GpuCloud) -> Result<Vec<GaussianScore>, GpuError> {
+    /// The sums over all views since the last clearing, to be read back.
+    pub fn parts(&self, cloud: &GpuCloud) -> [Part<'_>; 2] {
         assert_eq!(self.capacity, cloud.capacity(), "the scores are those of this cloud");
-        let planes = [0, self.capacity].map(|first| self.scores.part::<[f32; 4]>(first, cloud.len()));
-        let read = gpu.read(None, &planes)?;
-        let (seen, gradients): (Vec<[f32; 4]>, Vec<[f32; 4]>) = (read.part(0), read.part(1));
+        [0, self.capacity].map(|first| self.scores.part::<[f32; 4]>(first, cloud.len()))
+    }
+}
+
+impl GaussianScore {
+    /// Those of a map, `[N]`; their parts are `first` and the next one.
+    pub(crate) fn of(read: &ReadBack<'_>, first: usize) -> Vec<Self> {
+        let (seen, gradients): (Vec<[f32; 4]>, Vec<[f32; 4]>) = (read.part(first), read.part(first + 1));
         let score = |(s, g): (&[f32; 4], &[f32; 4])| GaussianScore {
             error_pixels: s[0],
             weighted_error_pixels: s[1],
@@ -151,6 +156,6 @@ impl Scores {
             views: g[2],
             metres_per_pixel: g[3],
         };
-        Ok(seen.iter().zip(&gradients).map(score).collect())
+        seen.iter().zip(&gradients).map(score).collect()
     }
 }

@@ -11,12 +11,11 @@ pub use state::TrainerState;
 use super::image_buffers::{self, ImageBuffers};
 use super::kernels::Kernels;
 use super::scores::{ErrorPixels, GaussianScore, ScoredImage, Scores};
-use super::tile_sampling::{TileSampler, TileSampling};
 use super::{AdamConfig, LossConfig, LossTerms, Pixels, TargetImage};
 use crate::geometry::Pinhole;
 use crate::gpu::{Gpu, GpuBuffer, GpuError};
 use crate::render::layout::StepLog;
-use crate::render::{BlendForm, GpuCloud, Rasterizer, Rendered, ViewCounts};
+use crate::render::{BlendForm, GaussianGeometry, GpuCloud, Rasterizer, Rendered, ViewCounts};
 use crate::splat::{Exposure, GaussianCloud, ViewCamera};
 
 /// What a step did.
@@ -39,22 +38,27 @@ pub struct TrainingView<'a> {
     pub streamed: Option<&'a Pixels>,
     /// Whether the step also scores the Gaussians (see [`Trainer::begin_scores`]).
     pub scored: Option<ErrorPixels>,
-    /// Factor on all learning rates of the step.
-    pub lr_scale: f32,
     /// Factor on the weight of the target's depth in the loss: 1 if a sensor measured it.
     pub depth_confidence: f32,
     /// Exposure of the target against the map's.
     pub exposure: Exposure,
-    /// Tiles that the step samples; `None`: all. A scored step uses all.
-    pub tile_sampling: Option<TileSampling>,
 }
 
 impl<'a> TrainingView<'a> {
     /// The whole view at full learning rates and in the map's exposure, not scored.
     pub fn new(camera: ViewCamera, target: &'a TargetImage) -> Self {
         let exposure = Exposure::default();
-        Self { camera, target, streamed: None, scored: None, lr_scale: 1.0, depth_confidence: 1.0, exposure, tile_sampling: None }
+        Self { camera, target, streamed: None, scored: None, depth_confidence: 1.0, exposure }
     }
+}
+
+/// The Gaussians after scored steps, `[N]` in map order.
+#[derive(Clone, Debug, Default)]
+pub struct ScoredMap {
+    /// What the scored views say of them.
+    pub scores: Vec<GaussianScore>,
+    /// Averaged over recent steps.
+    pub geometry: Vec<GaussianGeometry>,
 }
 
 /// Gradient of a loss by the map.
@@ -95,7 +99,6 @@ pub struct Trainer {
     rasterizer: Rasterizer,
     kernels: Kernels,
     scores: Scores,
-    sampler: TileSampler,
     /// Steps submitted so far, and the host's time to encode and submit them.
     steps: usize,
     encode_time: Duration,
@@ -138,7 +141,6 @@ impl Trainer {
         Ok(Self {
             kernels,
             scores: Scores::new(&rasterizer)?,
-            sampler: TileSampler::new(&rasterizer),
             steps: 0,
             encode_time: Duration::ZERO,
             images: Vec::new(),
@@ -161,13 +163,30 @@ impl Trainer {
         loss: &LossConfig,
         adam: &AdamConfig,
     ) -> Result<Vec<StepReport>, GpuError> {
+        Ok(self.steps_and_scores(cloud, views, loss, adam)?.0)
+    }
+
+    /// The same; with the scores since [`Self::begin_scores`] if the last views are scored, read in the same wait.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
+    pub fn steps_and_scores(
+        &mut self,
+        cloud: &GpuCloud,
+        views: &[TrainingView<'_>],
+        loss: &LossConfig,
+        adam: &AdamConfig,
+    ) -> Result<(Vec<StepReport>, Option<ScoredMap>), GpuError> {
         let mut reports = vec![StepReport::default(); views.len()];
+        let with_scores = views.last().is_some_and(|view| view.scored.is_some());
+        let mut scored = None;
         let mut pending: Vec<usize> = (0..views.len()).collect();
         while !pending.is_empty() {
             let mut repeat = Vec::new();
             for chunk in pending.chunks(STEPS_AT_ONCE) {
                 let chosen: Vec<&TrainingView<'_>> = chunk.iter().map(|&i| &views[i]).collect();
-                let logs = self.steps_at_once(cloud, &chosen, loss, adam)?;
+                let (logs, scores) = self.steps_at_once(cloud, &chosen, with_scores, loss, adam)?;
+                scored = scores;
                 for (&i, log) in chunk.iter().zip(&logs) {
                     let pixels = views[i].target.width * views[i].target.height;
                     match self.rasterizer.counts(&log.counters) {
@@ -179,42 +198,51 @@ impl Trainer {
             }
             pending = repeat;
         }
-        Ok(reports)
+        Ok((reports, scored))
     }
 
-    /// Takes up to [`STEPS_AT_ONCE`] steps and reads their logs. They are one submission where their views have one size, and none of them but the
-    /// first streams its target.
+    /// Takes up to [`STEPS_AT_ONCE`] steps and reads their logs, with the scores if wanted. They are one submission where their views
+    /// have one size, and none of them but the first streams its target.
     fn steps_at_once(
         &mut self,
         cloud: &GpuCloud,
         views: &[&TrainingView<'_>],
+        with_scores: bool,
         loss: &LossConfig,
         adam: &AdamConfig,
-    ) -> Result<Vec<StepLog>, GpuError> {
+    ) -> Result<(Vec<StepLog>, Option<ScoredMap>), GpuError> {
         let gpu = self.rasterizer.gpu().clone();
         let size = |view: &TrainingView<'_>| (view.target.width, view.target.height);
+        let mut unsubmitted = None;
         let mut taken = 0;
         for together in views.chunk_by(|before, view| view.streamed.is_none() && size(before) == size(view)) {
+            unsubmitted.take().into_iter().for_each(|encoder| gpu.submit(encoder));
             let started = Instant::now();
             let mut encoder = gpu.device.create_command_encoder(&Default::default());
             let mut pass = encoder.begin_compute_pass(&Default::default());
             for view in together {
-                let view = TrainingView { tile_sampling: view.tile_sampling.filter(|_| view.scored.is_none()), ..**view };
                 let viewpoint = Viewpoint { camera: &view.camera, background: [0.0; 3] };
-                let objective = Objective::Image { view, loss, log: taken };
+                let objective = Objective::Image { view: **view, loss, log: taken };
                 self.encode(&mut pass, cloud, &viewpoint, &objective, &Sink::Adam(adam))?;
                 self.steps += 1;
                 taken += 1;
             }
             drop(pass);
             self.rasterizer.uniforms.upload(&gpu);
-            gpu.submit(encoder);
+            unsubmitted = Some(encoder);
             self.encode_time += started.elapsed();
         }
         let words = LOG_STRIDE / std::mem::size_of::<u32>();
-        let log: Vec<u32> = self.log.read(&gpu, 0, taken * words)?;
-        let entry = |bytes: &[u32]| bytemuck::pod_read_unaligned(&bytemuck::cast_slice(bytes)[..std::mem::size_of::<StepLog>()]);
-        Ok(log.chunks_exact(words).map(entry).collect())
+        let mut parts = vec![self.log.part::<u32>(0, taken * words)];
+        if with_scores {
+            parts.extend(self.scores.parts(cloud));
+            parts.extend(cloud.geometry_parts());
+        }
+        let read = gpu.read(unsubmitted, &parts)?;
+        let entry = |log: &[u32]| bytemuck::pod_read_unaligned(&bytemuck::cast_slice(log)[..std::mem::size_of::<StepLog>()]);
+        let logs = read.part::<u32>(0).chunks_exact(words).map(entry).collect();
+        let scored = with_scores.then(|| ScoredMap { scores: GaussianScore::of(&read, 1), geometry: cloud.geometry(&read, 3) });
+        Ok((logs, scored))
     }
 
     /// Renders a view over `background` and reads it back.
@@ -247,7 +275,8 @@ impl Trainer {
     /// # Errors
     /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn read_scores(&self, cloud: &GpuCloud) -> Result<Vec<GaussianScore>, GpuError> {
-        self.scores.read(self.rasterizer.gpu(), cloud)
+        let read = self.rasterizer.gpu().read(None, &self.scores.parts(cloud))?;
+        Ok(GaussianScore::of(&read, 0))
     }
 
     /// The host's time to encode and submit all steps so far.
@@ -343,34 +372,26 @@ impl Trainer {
         sink: &Sink<'_>,
     ) -> Result<(), GpuError> {
         let gpu = self.rasterizer.gpu().clone();
-        let mut prepared = self.rasterizer.prepare(cloud, viewpoint.camera, viewpoint.background)?;
+        let prepared = self.rasterizer.prepare(cloud, viewpoint.camera, viewpoint.background)?;
         image_buffers::choose(&mut self.images, &gpu, (prepared.view.width, prepared.view.height))?;
         match objective {
             Objective::Image { view, loss, log } => {
                 if let (None, Some(pixels)) = (&view.target.pixels, view.streamed) {
                     self.images[0].stream(&gpu, pixels)?;
                 }
-                prepared.samples_tiles = view.tile_sampling.is_some();
-                let lr_scale = view.lr_scale;
                 let cells = self.put_uniforms(view, loss, &prepared);
-                let target = self.images[0].target(view.target);
-                if let Some(setup) = cells.sampling {
-                    self.sampler.encode_sample(pass, &self.rasterizer, &prepared, target.tile_losses, setup);
-                }
                 self.rasterizer.encode_forward(pass, cloud.parameters(), &prepared);
-                if cells.sampling.is_some() {
-                    self.sampler.encode_fill(pass, &self.rasterizer, &prepared, &target, cells.loss);
-                }
-                self.encode_loss(pass, &prepared, &target, cells.loss, &self.logs[*log]);
+                let target = self.images[0].pixels(view.target);
+                self.encode_loss(pass, &prepared, target, cells.loss, &self.logs[*log]);
                 if let Some(setup) = cells.scores {
                     let image = ScoredImage { gradients: &self.images[0].gradients, log: &self.logs[*log] };
                     self.scores.encode(pass, &self.rasterizer, &prepared, &image, setup);
                 }
-                self.encode_backward(pass, cloud, &prepared, sink, lr_scale);
+                self.encode_backward(pass, cloud, &prepared, sink);
             }
             Objective::Given => {
                 self.rasterizer.encode_forward(pass, cloud.parameters(), &prepared);
-                self.encode_backward(pass, cloud, &prepared, sink, 1.0);
+                self.encode_backward(pass, cloud, &prepared, sink);
             }
         }
         gpu.mark(pass, Self::END_MARK);

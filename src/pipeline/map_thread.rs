@@ -73,8 +73,12 @@ impl MapThread<'_> {
         };
         let mut summary = MapSummary { cloud, keyframes: records, ..MapSummary::default() };
         let mut checkpoints = Checkpoints { checkpointer, failed: false };
-        let mapped = self.map_messages(&mut mapper, &mut summary, &mut checkpoints);
+        let mut snapshots = Snapshots::default();
+        let mapped = self.map_messages(&mut mapper, &mut summary, &mut snapshots, &mut checkpoints);
         summary.error = mapped.err();
+        // Also after an error: a device that still answers gives all that was mapped.
+        let last = guarded("mapping", || snapshots.last(&mapper, &mut summary, self.progress));
+        summary.error = summary.error.or(last.err());
         if summary.error.is_none() && mapper.has_not_begun() && !summary.keyframes.is_empty() {
             summary.error = Some(MappingError::NoDepth.into());
         }
@@ -130,6 +134,7 @@ impl MapThread<'_> {
         &self,
         mapper: &mut Mapper,
         summary: &mut MapSummary,
+        snapshots: &mut Snapshots,
         checkpoints: &mut Checkpoints,
     ) -> Result<(), PipelineError> {
         let earlier_s = summary.keyframes.last().map_or(0.0, |record| record.done_s);
@@ -142,7 +147,7 @@ impl MapThread<'_> {
                 self.progress.stopped() || (self.config.yields_to_keyframes && inbox.keyframe_waits())
             };
             checkpoints.checkpointer.iter_mut().for_each(|c| c.received(&message));
-            let Processed { report, cloud } = guarded("mapping", || self.process(mapper, message, &stop))?;
+            let Processed { report, changed } = guarded("mapping", || self.process(mapper, message, &stop))?;
             tracing::debug!(?report, "message processed");
             let record = |report| KeyframeRecord {
                 report,
@@ -152,8 +157,10 @@ impl MapThread<'_> {
                 host_bytes: machine::host_bytes(),
             };
             summary.keyframes.extend(report.map(record));
-            let psnr_db = summary.keyframes.last().map_or(0.0, |k| k.report.psnr_db);
-            summary.publish(cloud, psnr_db, self.progress);
+            snapshots.is_stale |= changed;
+            if snapshots.is_due() {
+                guarded("mapping", || snapshots.take(mapper, summary, self.progress))?;
+            }
             // A keyframe that was cut short differs from that of an unbroken run.
             if report.is_some() && !self.progress.stopped() {
                 checkpoints.finished_one(mapper, None, &summary.keyframes);
@@ -174,8 +181,7 @@ impl MapThread<'_> {
                 (Some(report), report.inserted + report.iterations > 0)
             }
         };
-        let cloud = if changed { Some(Arc::new(mapper.download()?)) } else { None };
-        Ok(Processed { report, cloud })
+        Ok(Processed { report, changed })
     }
 
     /// The final refinement, one round at a time, each published; continues the one that a resumed run had begun.
@@ -191,7 +197,7 @@ impl MapThread<'_> {
         while let Some(report) = mapper.refine(&mut refinement, &|| self.progress.stopped())? {
             tracing::debug!(?report, "refined");
             summary.expose(&mapper.exposures().collect());
-            summary.publish(Some(Arc::new(mapper.download()?)), report.psnr_db, self.progress);
+            summary.publish(Arc::new(mapper.download()?), report.psnr_db, self.progress);
             on_round(Round { cloud: &summary.cloud, steps: mapper.step_times().len() });
             if !self.progress.stopped() {
                 checkpoints.finished_one(mapper, Some(&refinement), &summary.keyframes);
@@ -266,8 +272,41 @@ fn wait_for_tracker(frames: &Receiver<Frame>) {
 /// Effects of one message.
 struct Processed {
     report: Option<KeyframeReport>,
-    /// The map, if it changed.
-    cloud: Option<Arc<GaussianCloud>>,
+    /// Whether the map changed.
+    changed: bool,
+}
+
+/// Snapshots of the map while the recording lasts: a download waits for the GPU and moves the whole map.
+#[derive(Debug, Default)]
+struct Snapshots {
+    /// Whether the map has changed since the last one.
+    is_stale: bool,
+    /// When the last one was taken, and how long that took.
+    last: Option<(Instant, Duration)>,
+}
+
+impl Snapshots {
+    /// Time between two snapshots, in units of what one takes.
+    const INTERVAL: u32 = 20;
+
+    fn is_due(&self) -> bool {
+        self.is_stale && self.last.is_none_or(|(at, cost)| at.elapsed() >= Self::INTERVAL * cost)
+    }
+
+    fn take(&mut self, mapper: &Mapper, summary: &mut MapSummary, progress: &Progress) -> Result<(), PipelineError> {
+        let began = Instant::now();
+        let cloud = Arc::new(mapper.download()?);
+        self.last = Some((Instant::now(), began.elapsed()));
+        self.is_stale = false;
+        let psnr_db = summary.keyframes.last().map_or(0.0, |k| k.report.psnr_db);
+        summary.publish(cloud, psnr_db, progress);
+        Ok(())
+    }
+
+    /// That of the whole map, once no more keyframes come.
+    fn last(&mut self, mapper: &Mapper, summary: &mut MapSummary, progress: &Progress) -> Result<(), PipelineError> {
+        if self.is_stale { self.take(mapper, summary, progress) } else { Ok(()) }
+    }
 }
 
 impl MapSummary {
@@ -278,8 +317,7 @@ impl MapSummary {
         }
     }
 
-    fn publish(&mut self, changed: Option<Arc<GaussianCloud>>, psnr_db: f32, progress: &Progress) {
-        let Some(cloud) = changed else { return };
+    fn publish(&mut self, cloud: Arc<GaussianCloud>, psnr_db: f32, progress: &Progress) {
         self.cloud = cloud.clone();
         progress.mapping.force_push(MapSnapshot { cloud, keyframes: self.keyframes.len(), psnr_db });
     }

@@ -10,7 +10,7 @@ pub use motion::RunMotion;
 use super::layout::{BlendForm, GEOMETRY_PLANES, GatherSetup};
 use super::plan::{GaussianGeometry, Plan};
 use super::shaders;
-use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, Part, plain, workgroups};
+use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, Part, ReadBack, plain, workgroups};
 use crate::splat::{GaussianCloud, ShDegree};
 
 /// Parameters, first and second moments, averages.
@@ -258,15 +258,23 @@ impl GpuCloud {
     /// # Errors
     /// [`GpuError`] if the device fails.
     pub fn read_geometry(&self, gpu: &Gpu) -> Result<Vec<GaussianGeometry>, GpuError> {
-        let parts: Vec<Part<'_>> = self.parts(&self.averages).take(GEOMETRY_PLANES).collect();
-        let read = gpu.read(None, &parts)?;
-        let [positions, scales, rotations] = [0, 1, 2].map(|plane| read.part::<[f32; 4]>(plane));
+        Ok(self.geometry(&gpu.read(None, &self.geometry_parts())?, 0))
+    }
+
+    /// The same, to be read back with others.
+    pub(crate) fn geometry_parts(&self) -> [Part<'_>; GEOMETRY_PLANES] {
+        [0, 1, 2].map(|plane| self.averages.part::<[f32; 4]>(plane * self.capacity, self.count))
+    }
+
+    /// The averaged geometry of all Gaussians, `[N]` in map order; its parts are `first` and the following ones.
+    pub(crate) fn geometry(&self, read: &ReadBack<'_>, first: usize) -> Vec<GaussianGeometry> {
+        let [positions, scales, rotations] = [0, 1, 2].map(|plane| read.part::<[f32; 4]>(first + plane));
         let geometry = |i: usize| {
             let ([x, y, z, raw_opacity], [a, b, c, _], [qw, qx, qy, qz]) = (positions[i], scales[i], rotations[i]);
             let (mean, log_scale, rotation) = (Vec3::new(x, y, z), Vec3::new(a, b, c), Quat::from_xyzw(qx, qy, qz, qw));
             GaussianGeometry { mean, raw_opacity, log_scale, rotation }
         };
-        Ok((0..self.count).map(geometry).collect())
+        (0..self.count).map(geometry).collect()
     }
 
     /// The filled part of each plane of a buffer of the map's shape, `[N]` vec4.

@@ -256,21 +256,6 @@ host_twins! {
         /// Unused.
         pad: [u32; 3],
     }
-    /// Sampling of a step's tiles (`shaders/sample_tiles.wgsl`).
-    TileSamplingSetup {
-        /// Share of the steps that sample a tile of mean loss; other tiles in proportion to theirs.
-        share: f32,
-        /// Least share of the steps that sample a tile.
-        min_share: f32,
-        /// Loss a pixel below which a tile has the least share.
-        noise: f32,
-        /// λ of SSIM against L1.
-        ssim_weight: f32,
-        /// Weight of the depth term, 1/metres.
-        depth_weight: f32,
-        /// Seed of the step.
-        seed: u32,
-    }
     /// Compaction of the map's planes (`shaders/gather.wgsl`).
     GatherSetup {
         /// Gaussians that stay.

@@ -92,8 +92,6 @@ pub struct PreparedView {
     pub uniform: UniformCell,
     /// Which of `workspace.slots` holds the sorted intersections.
     pub sorted: usize,
-    /// Whether a draw precedes the view, which leaves out some of the tiles.
-    pub samples_tiles: bool,
 }
 
 impl Rasterizer {
@@ -147,11 +145,6 @@ impl Rasterizer {
         self.uniforms.of(prepared.uniform)
     }
 
-    /// The mask of tiles that a prepared view leaves out.
-    pub fn unsampled(&self, prepared: &PreparedView) -> &GpuBuffer {
-        if prepared.samples_tiles { &self.workspace.unsampled } else { &self.workspace.none_unsampled }
-    }
-
     /// The form of the blending passes.
     pub fn form(&self) -> BlendForm {
         self.form
@@ -185,7 +178,7 @@ impl Rasterizer {
         view.sh_degree = u32::from(cloud.sh_degree().get());
         view.intersection_capacity = self.workspace.intersection_capacity as u32;
         let uniform = self.uniforms.put(&view);
-        Ok(PreparedView { view, uniform, sorted: Self::sorted(view.tiles()), samples_tiles: false })
+        Ok(PreparedView { view, uniform, sorted: Self::sorted(view.tiles()) })
     }
 
     /// Which of `workspace.slots` holds the sorted intersections of a view of so many tiles.
@@ -198,14 +191,7 @@ impl Rasterizer {
         let (gpu, ws, k) = (&*self.gpu, &self.workspace, &self.kernels);
         let (view, uniform) = (&prepared.view, self.view(prepared));
         let per_gaussian = workgroups(view.gaussian_count.div_ceil(256));
-        let project = [
-            (0, uniform),
-            (1, parameters),
-            (2, &ws.projected),
-            (3, &ws.visible),
-            (4, self.unsampled(prepared)),
-            (5, &ws.block_sums),
-        ];
+        let project = [(0, uniform), (1, parameters), (2, &ws.projected), (3, &ws.visible), (4, &ws.block_sums)];
         k.project_forward.dispatch(gpu, pass, &project, per_gaussian);
         self.encode_scan(pass, prepared, &self.visible_scan);
         let compact = [
@@ -256,7 +242,6 @@ impl Rasterizer {
                 (7, &ws.tile_keys[0]),
                 (8, &ws.slots[0]),
                 (9, &ws.slot_gaussians),
-                (10, self.unsampled(prepared)),
             ]
         };
         k.tile_lists.dispatch_indirect(gpu, pass, &lists(&self.count_mode), visible);

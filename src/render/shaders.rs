@@ -26,7 +26,6 @@ const HARMONICS: &str = include_str!("../../shaders/shared/spherical_harmonics.w
 const TILE: &str = include_str!("../../shaders/shared/tile.wgsl");
 const TILE_BACKWARD: &str = include_str!("../../shaders/shared/tile_backward.wgsl");
 const EXCLUSIVE_SUM: &str = include_str!("../../shaders/shared/exclusive_sum.wgsl");
-const SAMPLED_TILES: &str = include_str!("../../shaders/shared/sampled_tiles.wgsl");
 const PIXEL_WINDOW: &str = include_str!("../../shaders/shared/pixel_window.wgsl");
 const TARGET: &str = include_str!("../../shaders/shared/target.wgsl");
 const SINK_GRADIENT: &str = include_str!("../../shaders/shared/sink_gradient.wgsl");
@@ -45,18 +44,16 @@ macro_rules! shaders {
 }
 
 shaders! {
-    PROJECT_FORWARD = "project_forward", "project_forward", [VIEW, PROJECTION, HARMONICS, SAMPLED_TILES], ["main"];
+    PROJECT_FORWARD = "project_forward", "project_forward", [VIEW, PROJECTION, HARMONICS], ["main"];
     SCAN_BLOCKS = "scan_blocks", "scan_blocks", [VIEW, COUNTERS, EXCLUSIVE_SUM], ["main"];
     COMPACT_VISIBLE = "compact_visible", "compact_visible", [VIEW], ["main"];
     SORT = "sort", "sort", [VIEW, COUNTERS], ["count_digits", "scan_digits", "scatter"];
-    TILE_LISTS = "tile_lists", "tile_lists", [VIEW, COUNTERS, SAMPLED_TILES, EXCLUSIVE_SUM], ["main"];
+    TILE_LISTS = "tile_lists", "tile_lists", [VIEW, COUNTERS, EXCLUSIVE_SUM], ["main"];
     TILE_RANGES = "tile_ranges", "tile_ranges", [VIEW, COUNTERS], ["main"];
     ORDER_TILES = "order_tiles", "order_tiles", [VIEW], ["main"];
     RASTERIZE_FORWARD = "rasterize_forward", "rasterize_forward", [VIEW, TILE], ["main"];
-    SAMPLE_TILES = "sample_tiles", "sample_tiles", [VIEW], ["main"];
-    FILL_UNSAMPLED = "fill_unsampled", "fill_unsampled", [VIEW, SAMPLED_TILES, TARGET], ["main"];
-    LOSS_FORWARD = "loss_forward", "loss_forward", [PIXEL_WINDOW, TARGET, SAMPLED_TILES], ["main"];
-    LOSS_BACKWARD = "loss_backward", "loss_backward", [PIXEL_WINDOW, TARGET, SAMPLED_TILES], ["main"];
+    LOSS_FORWARD = "loss_forward", "loss_forward", [PIXEL_WINDOW, TARGET], ["main"];
+    LOSS_BACKWARD = "loss_backward", "loss_backward", [PIXEL_WINDOW, TARGET], ["main"];
     LOSS_REDUCE = "loss_reduce", "loss_reduce", [COUNTERS], ["main"];
     RASTERIZE_BACKWARD_NARROW = "rasterize_backward_narrow", "rasterize_backward_narrow", [VIEW, TILE, TILE_BACKWARD], ["main"];
     RASTERIZE_BACKWARD_WIDE = "rasterize_backward_wide", "rasterize_backward_wide", [VIEW, TILE, TILE_BACKWARD], ["main"];

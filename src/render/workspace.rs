@@ -7,8 +7,6 @@ use crate::gpu::{Gpu, GpuBuffer, GpuError};
 
 /// Bytes of one intersection's gradient: three vec4.
 const INTERSECTION_GRADIENT_BYTES: u64 = 48;
-/// Bytes of the mask of unsampled tiles, one bit a tile: what a uniform may hold anywhere.
-const UNSAMPLED_MASK_BYTES: u64 = 16_384;
 
 /// Scratch that one rendered view leaves behind for its backward pass. Sizes only grow.
 #[derive(Debug)]
@@ -36,9 +34,6 @@ pub(crate) struct Workspace {
     pixels: u32,
     tiles: u32,
     pub(crate) ranges: GpuBuffer,
-    /// One bit a tile; zeros where all tiles are sampled.
-    pub(crate) unsampled: GpuBuffer,
-    pub(crate) none_unsampled: GpuBuffer,
     pub(crate) color_depth: GpuBuffer,
     pub(crate) state: GpuBuffer,
 }
@@ -74,8 +69,6 @@ impl Workspace {
             pixels: 0,
             tiles: 0,
             ranges: empty("ranges")?,
-            unsampled: GpuBuffer::computed_uniform(gpu, "unsampled tiles", UNSAMPLED_MASK_BYTES)?,
-            none_unsampled: GpuBuffer::computed_uniform(gpu, "no unsampled tiles", UNSAMPLED_MASK_BYTES)?,
             color_depth: empty("rendered")?,
             state: empty("rendered state")?,
         };

@@ -6,7 +6,7 @@ use fastrand::Rng;
 use image::RgbImage;
 use keysplat::geometry::Pinhole;
 use keysplat::gpu::Gpu;
-use keysplat::optimise::{AdamConfig, ImageGradients, LossConfig, TargetImage, TileSampling, Trainer, TrainingView, ssim_phase};
+use keysplat::optimise::{AdamConfig, ImageGradients, LossConfig, TargetImage, Trainer, TrainingView, ssim_phase};
 use keysplat::render::{BlendForm, GpuCloud, Rasterizer};
 use keysplat::splat::{Exposure, GaussianCloud, ShDegree, ViewCamera};
 use keysplat::verification::reference::adam::{Adam64, Decay64};
@@ -289,25 +289,22 @@ fn an_exposed_target_counts_as_the_one_in_the_maps_exposure() {
         changed.pixels_mut().for_each(|p| p.0 = p.0.map(change));
         upload_target(&gpu, &changed, &wide)
     };
-    // A target of its own each time: it remembers the losses of its tiles.
-    let learn = |change: &dyn Fn(u8) -> u8, gain: f32, tile_sampling: Option<TileSampling>| {
+    let learn = |change: &dyn Fn(u8) -> u8, gain: f32| {
         let target = of(change);
         let mut trainer = Trainer::new(gpu.clone()).unwrap();
         let on_gpu = upload(&gpu, &cloud);
         let exposure = Exposure([gain.ln(); 3]);
-        let views = [TrainingView { exposure, tile_sampling, ..TrainingView::new(camera, &target) }; 3];
+        let views = [TrainingView { exposure, ..TrainingView::new(camera, &target) }; 3];
         let loss = LossConfig::default();
         let reports = trainer.steps(&on_gpu, &views, &loss, &AdamConfig::default()).unwrap();
         f64::from(reports[2].loss.total(&loss))
     };
-    for sampling in [None, Some(TileSampling { share: 0.5, min_share: 0.1, noise: 0.0 })] {
-        let (expected, other) = (learn(&|v| v / 2, 1.0, sampling), learn(&|v| v / 2, 1.3, sampling));
-        let double = learn(&|v| v / 2 * 2, 2.0, sampling);
-        assert!((double - expected).abs() < 1e-3 * expected, "{double} is not {expected}");
-        assert!((other - expected).abs() > 1e-2 * expected, "the exposure does nothing here");
-        let (white, beyond) = (learn(&|_| 255, 1.0, sampling), learn(&|_| 200, 0.5, sampling));
-        assert!((white - beyond).abs() < 1e-6 * white, "{white} is not {beyond}");
-    }
+    let (expected, other) = (learn(&|v| v / 2, 1.0), learn(&|v| v / 2, 1.3));
+    let double = learn(&|v| v / 2 * 2, 2.0);
+    assert!((double - expected).abs() < 1e-3 * expected, "{double} is not {expected}");
+    assert!((other - expected).abs() > 1e-2 * expected, "the exposure does nothing here");
+    let (white, beyond) = (learn(&|_| 255, 1.0), learn(&|_| 200, 0.5));
+    assert!((white - beyond).abs() < 1e-6 * white, "{white} is not {beyond}");
 }
 
 #[test]

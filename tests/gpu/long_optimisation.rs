@@ -4,7 +4,7 @@
 use fastrand::Rng;
 use glam::Vec3;
 use image::{Rgb, RgbImage};
-use keysplat::optimise::{AdamConfig, LossConfig, TargetImage, TileSampling, Trainer, TrainingView};
+use keysplat::optimise::{AdamConfig, LossConfig, TargetImage, Trainer, TrainingView};
 use keysplat::render::GpuCloud;
 use keysplat::splat::ShDegree;
 
@@ -40,8 +40,7 @@ fn two_hundred_steps_on_noise_end_finite() {
         let depth: Vec<f32> =
             (0..48 * 32).map(|_| if rng.f32() < 0.2 { 0.0 } else { crate::common::between(&mut rng, 0.05, 60.0) }).collect();
         let target = TargetImage::new(&gpu, &image, Some(&depth)).unwrap();
-        let skip = (seed % 2 == 1).then_some(TileSampling { share: 0.5, min_share: 0.1, noise: 0.0 });
-        let view = TrainingView { tile_sampling: skip, ..TrainingView::new(camera, &target) };
+        let view = TrainingView::new(camera, &target);
         let mut losses = Vec::new();
         for _ in 0..STEPS / BATCH {
             let reports = trainer.steps(&on_gpu, &[view; BATCH], &LossConfig::default(), &adam).unwrap();

@@ -15,4 +15,4 @@ mod reference_gradients;
 mod scores;
 mod shaders;
 mod stress;
-mod tile_sampling;
+mod traffic;

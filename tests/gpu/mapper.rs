@@ -12,7 +12,7 @@ use keysplat::splat::{Exposure, ShDegree};
 
 const PINHOLE: Pinhole = Pinhole { fx: 60.0, fy: 60.0, cx: 31.5, cy: 23.5, width: 64, height: 48 };
 
-fn keyframe(id: usize, with_depth: bool) -> Keyframe {
+pub fn keyframe(id: usize, with_depth: bool) -> Keyframe {
     let (width, height) = (PINHOLE.width, PINHOLE.height);
     let color = RgbImage::from_fn(width, height, |x, y| Rgb([(x * 4) as u8, (y * 5) as u8, ((x / 6 + y / 6) % 2 * 200) as u8]));
     let depth = with_depth.then(|| DepthImage { width, height, metres: vec![2.0; (width * height) as usize] });

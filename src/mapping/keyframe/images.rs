@@ -3,10 +3,9 @@
 use std::borrow::Cow;
 
 use image::{Rgb, RgbImage};
-use serde::{Deserialize, Serialize};
 
 use crate::geometry::Pinhole;
-use crate::gpu::{Gpu, GpuError, plain};
+use crate::gpu::{Gpu, GpuError};
 use crate::mapping::MappingError;
 use crate::mapping::image_store::{ImageStore, StoredImage};
 use crate::optimise::{Pixels, TargetImage};
@@ -22,15 +21,6 @@ pub(super) struct Images {
     stored: Option<(StoredImage, Option<StoredImage>)>,
 }
 
-/// `[tiles]` of the image and of the one at half the size, empty where there is none.
-#[derive(Clone, Debug, Serialize, Deserialize)]
-pub(super) struct TileLosses {
-    #[serde(with = "plain")]
-    whole: Vec<[f32; 4]>,
-    #[serde(with = "plain")]
-    half: Vec<[f32; 4]>,
-}
-
 impl Images {
     /// Uploads an image; `with_half` also at half the size, if that is still an image worth comparing.
     pub fn new(gpu: &Gpu, image: &RectifiedImage, with_half: bool) -> Result<Self, GpuError> {
@@ -40,17 +30,6 @@ impl Images {
         };
         let worth = with_half && image.pinhole.width.min(image.pinhole.height) >= MIN_HALVED;
         Ok(Self { whole: target(image)?, half: worth.then(|| target(&halved(image))).transpose()?, stored: None })
-    }
-
-    pub fn tile_losses(&self, gpu: &Gpu) -> Result<TileLosses, GpuError> {
-        let half = self.half.as_ref().map_or(Ok(Vec::new()), |half| half.tile_losses(gpu));
-        Ok(TileLosses { whole: self.whole.tile_losses(gpu)?, half: half? })
-    }
-
-    /// Says whether they are of images of these sizes.
-    pub fn set_tile_losses(&self, gpu: &Gpu, losses: &TileLosses) -> bool {
-        let half = self.half.as_ref().map_or(losses.half.is_empty(), |half| half.set_tile_losses(gpu, &losses.half));
-        self.whole.set_tile_losses(gpu, &losses.whole) && half
     }
 
     /// Moves the pixels from the GPU to the store.

@@ -3,7 +3,7 @@
 use super::{Mapper, Step};
 use crate::mapping::density::{self, Candidate};
 use crate::mapping::{DensityConfig, DensityStrategy, MappingError};
-use crate::optimise::{ErrorPixels, GaussianScore};
+use crate::optimise::{ErrorPixels, GaussianScore, ScoredMap};
 
 impl Mapper {
     /// Whether, and by what, Gaussians are scored: for control of their density, or to know which to give up.
@@ -12,17 +12,22 @@ impl Mapper {
         wanted.then(|| density.error_pixels())
     }
 
-    /// Removes and divides Gaussians by the scores of the steps just taken; returns how many fewer and how many more there are for it.
-    pub(super) fn control_density(&mut self, density: &DensityConfig) -> Result<(usize, usize), MappingError> {
+    /// Removes and divides Gaussians by the scores of the steps just taken, if any were scored; returns how many fewer and how many more there
+    /// are for it.
+    pub(super) fn control_density(
+        &mut self,
+        scored: Option<ScoredMap>,
+        density: &DensityConfig,
+    ) -> Result<(usize, usize), MappingError> {
         if self.cloud.is_empty() {
             return Ok((0, 0));
         }
-        let scores = match self.scoring(density) {
-            Some(_) => self.trainer.read_scores(&self.cloud)?,
-            None => vec![GaussianScore::default(); self.cloud.len()],
+        let unscored = || -> Result<ScoredMap, MappingError> {
+            let scores = vec![GaussianScore::default(); self.cloud.len()];
+            Ok(ScoredMap { scores, geometry: self.cloud.read_geometry(&self.gpu)? })
         };
+        let ScoredMap { scores, geometry } = scored.map_or_else(unscored, Ok)?;
         self.stats.scored(&scores);
-        let geometry = self.cloud.read_geometry(&self.gpu)?;
         let histories = self.stats.histories();
         let candidates: Vec<Candidate> =
             (0..self.cloud.len()).map(|i| Candidate { geometry: geometry[i], score: scores[i], history: histories[i] }).collect();

@@ -67,17 +67,24 @@ impl FinalRefinement {
 }
 
 impl Mapper {
-    /// Takes the online steps that follow a keyframe, until `stop`; where steps yield to keyframes, without end.
+    /// Steps, and the online steps of the running epoch that follow them.
+    pub(super) fn with_consolidation(&mut self, mut steps: Vec<Step>) -> Vec<Step> {
+        if !self.config.yields_to_keyframes {
+            steps.extend(self.draw(self.config.refine.steps_per_keyframe, false));
+        }
+        steps
+    }
+
+    /// Takes steps of the running epoch until `stop`.
     ///
     /// # Errors
     /// [`MappingError`] if a buffer does not fit or the device fails.
-    pub(super) fn consolidate(&mut self, stop: &dyn Fn() -> bool) -> Result<Taken, MappingError> {
+    pub(super) fn consolidate_until(&mut self, stop: &dyn Fn() -> bool) -> Result<Taken, MappingError> {
         let config = self.config.clone();
-        let steps = if config.yields_to_keyframes { usize::MAX } else { config.refine.steps_per_keyframe };
         let mut taken = Taken::default();
-        while taken.steps < steps && !self.cloud.is_empty() && !stop() {
-            let batch = self.draw(self.batch().min(steps - taken.steps), false);
-            taken += self.consolidation_steps(&batch, &config.adam)?;
+        while !self.cloud.is_empty() && !stop() {
+            let batch = self.draw(self.batch(), false);
+            taken += self.steps(&batch, &config.adam)?;
         }
         Ok(taken)
     }
@@ -97,11 +104,6 @@ impl Mapper {
     /// All keyframes, ascending.
     fn views(&self) -> Vec<usize> {
         (0..self.keyframes.len()).collect()
-    }
-
-    fn consolidation_steps(&mut self, batch: &[Step], adam: &AdamConfig) -> Result<Taken, MappingError> {
-        let sampling = if self.config.refine.all_tiles { None } else { self.tile_sampling() };
-        self.steps(batch, sampling, adam)
     }
 
     /// Begins a refinement, and with it an epoch, over the keyframes so far; none may come until it is done.
@@ -141,7 +143,7 @@ impl Mapper {
             let coarse = refinement.progress() < half_size_share;
             let batch = self.draw(BATCH.min(end - refinement.done), coarse);
             adam = refinement.rates();
-            taken += self.consolidation_steps(&batch, &adam)?;
+            taken += self.steps(&batch, &adam)?;
             refinement.done += batch.len();
         }
         self.refine_exposures(refinement)?;
@@ -164,8 +166,9 @@ impl Mapper {
         refinement.rounds += 1;
         let steps = self.scoring_steps(&views, density);
         self.trainer.begin_scores(&self.cloud)?;
-        refinement.done += self.take(&steps, adam, &|| false)?.steps;
+        let taken = self.take(&steps, adam, &|| false)?;
+        refinement.done += taken.steps;
         self.stats.keyframe_mapped();
-        self.control_density(density)
+        self.control_density(taken.scored, density)
     }
 }

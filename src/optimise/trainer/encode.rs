@@ -4,14 +4,13 @@ use super::{Sink, Trainer, TrainingView};
 use crate::gpu::{GpuBuffer, IndirectSize, UniformCell};
 use crate::optimise::LossConfig;
 use crate::optimise::image_buffers::LOSS_TILE;
-use crate::optimise::loss::{TargetBuffers, ssim_phase};
+use crate::optimise::loss::{GpuPixels, ssim_phase};
 use crate::render::layout::{Counter, LossSetup, VISIBLE_COUNTER};
 use crate::render::{GpuCloud, PreparedView};
 
 /// Uniforms of a step beside its view.
 pub(super) struct StepUniforms {
     pub loss: UniformCell,
-    pub sampling: Option<UniformCell>,
     pub scores: Option<UniformCell>,
 }
 
@@ -37,10 +36,9 @@ impl Trainer {
             green_gain,
             blue_gain,
         };
-        let (seed, uniforms) = (self.steps as u32, &mut self.rasterizer.uniforms);
+        let uniforms = &mut self.rasterizer.uniforms;
         StepUniforms {
             loss: uniforms.put(&setup),
-            sampling: view.tile_sampling.map(|sampling| uniforms.put(&sampling.setup(loss, seed))),
             scores: view.scored.map(|pixels| uniforms.put(&pixels.setup(loss, prepared.view.pixels()))),
         }
     }
@@ -49,7 +47,7 @@ impl Trainer {
         &self,
         pass: &mut wgpu::ComputePass<'_>,
         prepared: &PreparedView,
-        target: &TargetBuffers<'_>,
+        target: &GpuPixels,
         setup: UniformCell,
         log: &GpuBuffer,
     ) {
@@ -61,14 +59,14 @@ impl Trainer {
             (0, self.rasterizer.uniforms.of(setup)),
             (1, &ws.color_depth),
             (2, &ws.state),
-            (3, target.color),
-            (4, target.depth),
+            (3, &target.color),
+            (4, &target.depth),
             (5, &self.images[0].partials),
         ];
-        let unsampled = self.rasterizer.unsampled(prepared);
-        let with = |last| inputs.iter().copied().chain([last, (7, unsampled)]).collect::<Vec<_>>();
-        k.loss_forward.dispatch(gpu, pass, &with((6, target.tile_losses)), forward);
-        k.loss_reduce.dispatch(gpu, pass, &[(0, target.tile_losses), (1, &ws.counters), (2, log)], [1, 1, 1]);
+        let loss_sums = &self.images[0].loss_sums;
+        let with = |last| inputs.iter().copied().chain([last]).collect::<Vec<_>>();
+        k.loss_forward.dispatch(gpu, pass, &with((6, loss_sums)), forward);
+        k.loss_reduce.dispatch(gpu, pass, &[(0, loss_sums), (1, &ws.counters), (2, log)], [1, 1, 1]);
         k.loss_backward.dispatch(gpu, pass, &with((6, &self.images[0].gradients)), backward);
     }
 
@@ -78,10 +76,9 @@ impl Trainer {
         cloud: &GpuCloud,
         prepared: &PreparedView,
         sink: &Sink<'_>,
-        lr_scale: f32,
     ) {
         let adam = match sink {
-            Sink::Adam(adam) => Some(self.rasterizer.uniforms.put(&adam.setup(self.steps, lr_scale))),
+            Sink::Adam(adam) => Some(self.rasterizer.uniforms.put(&adam.setup(self.steps))),
             Sink::Gradient(_) => None,
         };
         let (gpu, ws, k) = (self.rasterizer.gpu(), &self.rasterizer.workspace, &self.kernels);

@@ -7,7 +7,7 @@ use image::{Rgb, RgbImage};
 use super::scenes::{Fault, Scene, between};
 use super::{Family, Machine, Outcome, Part};
 use crate::gpu::GpuError;
-use crate::optimise::{AdamConfig, LossConfig, TargetImage, TileSampling, TrainingView};
+use crate::optimise::{AdamConfig, LossConfig, TargetImage, TrainingView};
 use crate::splat::{Gaussian, GaussianCloud};
 
 const STEPS: usize = 200;
@@ -50,9 +50,7 @@ fn train(machine: &Machine, rng: &mut Rng, scene: &Scene, fault: Fault) -> Resul
     let target = target(machine, rng, size)?;
     let (loss, adam) = (LossConfig::default(), AdamConfig::default());
     let on_gpu = machine.upload(&scene.cloud)?;
-    let skip = rng.bool().then_some(TileSampling { share: 0.5, min_share: 0.1, noise: 0.0 });
-    let view = TrainingView { tile_sampling: skip, ..TrainingView::new(scene.camera, &target) };
-    let whole = TrainingView { tile_sampling: None, ..view };
+    let view = TrainingView::new(scene.camera, &target);
     machine.with(rng.usize(..2), |trainer| {
         let mut outcome = Outcome::default();
         let mut losses = Vec::new();
@@ -65,8 +63,7 @@ fn train(machine: &Machine, rng: &mut Rng, scene: &Scene, fault: Fault) -> Resul
                 before_last = on_gpu.download(&machine.gpu)?;
                 before_last_by = trainer.gradients(&on_gpu, &scene.camera, &target, &loss)?.cloud;
             }
-            let views = if is_last { [whole; LAST_STEPS] } else { [view; LAST_STEPS] };
-            let reports = trainer.steps(&on_gpu, &views, &loss, &adam)?;
+            let reports = trainer.steps(&on_gpu, &[view; LAST_STEPS], &loss, &adam)?;
             losses.extend(reports.iter().map(|r| r.loss.total(&loss)));
         }
         outcome.require(losses.iter().all(|loss| loss.is_finite()), || "a loss is not finite".into());
