@@ -7,9 +7,8 @@ use std::time::Duration;
 use serde::Serialize;
 use wgpu::{Backends, InstanceDescriptor, InstanceFlags};
 
-use super::GpuBuffer;
 use super::profile::Profiler;
-use super::traffic::{Traffic, TrafficCount};
+use super::traffic::Traffic;
 
 /// Failure of the adapter, the device or an allocation on it.
 #[derive(Debug, thiserror::Error)]
@@ -124,7 +123,7 @@ pub struct Gpu {
     pub(super) memory: Arc<MemoryCount>,
     pub(super) traffic: Traffic,
     /// For the next readback.
-    staging: Mutex<Option<wgpu::Buffer>>,
+    pub(super) staging: Mutex<Option<wgpu::Buffer>>,
     pub(super) profiler: Option<Profiler>,
 }
 
@@ -314,37 +313,6 @@ impl Gpu {
             Some(Failure::OutOfMemory(what)) => Err(GpuError::OutOfMemory(what.clone())),
             Some(Failure::Failed(what)) => Err(GpuError::Failed(what.clone())),
         }
-    }
-
-    /// Submits the commands of `encoder`.
-    pub fn submit(&self, encoder: wgpu::CommandEncoder) {
-        self.queue.submit([encoder.finish()]);
-        self.traffic.submitted();
-    }
-
-    /// What has passed between host and adapter so far.
-    pub fn traffic(&self) -> TrafficCount {
-        self.traffic.count()
-    }
-
-    pub(super) fn take_staging(&self) -> Option<wgpu::Buffer> {
-        self.staging.lock().unwrap_or_else(PoisonError::into_inner).take()
-    }
-
-    pub(super) fn keep_staging(&self, staging: wgpu::Buffer) {
-        *self.staging.lock().unwrap_or_else(PoisonError::into_inner) = Some(staging);
-    }
-
-    /// Copies all of one buffer to the beginning of another.
-    pub fn copy(&self, encoder: &mut wgpu::CommandEncoder, from: &GpuBuffer, to: &GpuBuffer) {
-        encoder.copy_buffer_to_buffer(from.raw(), 0, to.raw(), 0, from.size());
-        self.traffic.copied();
-    }
-
-    /// Fills a buffer with zeros.
-    pub fn clear(&self, encoder: &mut wgpu::CommandEncoder, buffer: &GpuBuffer) {
-        encoder.clear_buffer(buffer.raw(), 0, None);
-        self.traffic.copied();
     }
 
     /// Waits until everything submitted is done, for ten minutes at most.

@@ -1,6 +1,7 @@
 //! Reading back: parts of several buffers in one submission and one wait, through a staging buffer that is kept.
 
 use std::ops::Range;
+use std::sync::PoisonError;
 
 use bytemuck::Pod;
 use wgpu::BufferUsages;
@@ -100,5 +101,13 @@ impl Gpu {
             Some(staging) => Ok(staging),
             None => allocate(self, "readback", bytes, BufferUsages::MAP_READ | BufferUsages::COPY_DST),
         }
+    }
+
+    fn take_staging(&self) -> Option<wgpu::Buffer> {
+        self.staging.lock().unwrap_or_else(PoisonError::into_inner).take()
+    }
+
+    fn keep_staging(&self, staging: wgpu::Buffer) {
+        *self.staging.lock().unwrap_or_else(PoisonError::into_inner) = Some(staging);
     }
 }

@@ -2,6 +2,8 @@
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
+use super::{Gpu, GpuBuffer};
+
 /// Counts since the device was opened; differences of two readings belong to what was done in between.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct TrafficCount {
@@ -83,5 +85,30 @@ impl Traffic {
             waits: of(&self.waits),
             bytes_read: of(&self.bytes_read),
         }
+    }
+}
+
+impl Gpu {
+    /// Submits the commands of `encoder`.
+    pub fn submit(&self, encoder: wgpu::CommandEncoder) {
+        self.queue.submit([encoder.finish()]);
+        self.traffic.submitted();
+    }
+
+    /// What has passed between host and adapter so far.
+    pub fn traffic(&self) -> TrafficCount {
+        self.traffic.count()
+    }
+
+    /// Copies all of one buffer to the beginning of another.
+    pub fn copy(&self, encoder: &mut wgpu::CommandEncoder, from: &GpuBuffer, to: &GpuBuffer) {
+        encoder.copy_buffer_to_buffer(from.raw(), 0, to.raw(), 0, from.size());
+        self.traffic.copied();
+    }
+
+    /// Fills a buffer with zeros.
+    pub fn clear(&self, encoder: &mut wgpu::CommandEncoder, buffer: &GpuBuffer) {
+        encoder.clear_buffer(buffer.raw(), 0, None);
+        self.traffic.copied();
     }
 }

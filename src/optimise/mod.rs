@@ -9,5 +9,5 @@ mod trainer;
 
 pub use adam::AdamConfig;
 pub use loss::{LossConfig, LossTerms, Pixels, TargetImage, ssim_phase};
-pub use scores::{ErrorPixels, GaussianScore};
-pub use trainer::{Gradients, ImageGradients, ScoredMap, StepReport, Trainer, TrainerState, TrainingView};
+pub use scores::{ErrorPixels, GaussianScore, ScoredMap};
+pub use trainer::{Gradients, ImageGradients, StepReport, Trainer, TrainerState, TrainingView};

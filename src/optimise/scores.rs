@@ -3,7 +3,7 @@
 use super::LossConfig;
 use crate::gpu::{Gpu, GpuBuffer, GpuError, IndirectSize, Kernel, Part, ReadBack, UniformCell};
 use crate::render::layout::{Counter, ScoreSetup, VISIBLE_COUNTER};
-use crate::render::{GpuCloud, PreparedView, Rasterizer, shaders};
+use crate::render::{GaussianGeometry, GpuCloud, PreparedView, Rasterizer, shaders};
 
 /// Definition of an error pixel (the high-error mask of FastGS).
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -42,6 +42,15 @@ pub struct GaussianScore {
     pub views: f32,
     /// Size of a pixel at its depth in the view nearest to it, metres.
     pub metres_per_pixel: f32,
+}
+
+/// The Gaussians after scored steps, `[N]` in map order.
+#[derive(Clone, Debug, Default)]
+pub struct ScoredMap {
+    /// What the scored views say of them.
+    pub scores: Vec<GaussianScore>,
+    /// Averaged over recent steps.
+    pub geometry: Vec<GaussianGeometry>,
 }
 
 /// A rendered image with its loss.

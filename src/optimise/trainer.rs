@@ -10,12 +10,12 @@ pub use state::TrainerState;
 
 use super::image_buffers::{self, ImageBuffers};
 use super::kernels::Kernels;
-use super::scores::{ErrorPixels, GaussianScore, ScoredImage, Scores};
+use super::scores::{ErrorPixels, GaussianScore, ScoredImage, ScoredMap, Scores};
 use super::{AdamConfig, LossConfig, LossTerms, Pixels, TargetImage};
 use crate::geometry::Pinhole;
 use crate::gpu::{Gpu, GpuBuffer, GpuError};
 use crate::render::layout::StepLog;
-use crate::render::{BlendForm, GaussianGeometry, GpuCloud, Rasterizer, Rendered, ViewCounts};
+use crate::render::{BlendForm, GpuCloud, Rasterizer, Rendered, ViewCounts};
 use crate::splat::{Exposure, GaussianCloud, ViewCamera};
 
 /// What a step did.
@@ -50,15 +50,6 @@ impl<'a> TrainingView<'a> {
         let exposure = Exposure::default();
         Self { camera, target, streamed: None, scored: None, depth_confidence: 1.0, exposure }
     }
-}
-
-/// The Gaussians after scored steps, `[N]` in map order.
-#[derive(Clone, Debug, Default)]
-pub struct ScoredMap {
-    /// What the scored views say of them.
-    pub scores: Vec<GaussianScore>,
-    /// Averaged over recent steps.
-    pub geometry: Vec<GaussianGeometry>,
 }
 
 /// Gradient of a loss by the map.
