@@ -9,8 +9,8 @@ use super::{Gpu, GpuBuffer};
 pub struct TrafficCount {
     /// Dispatches of kernels.
     pub dispatches: u64,
-    /// Copies between buffers and clearings, without those of readbacks.
-    pub copies: u64,
+    /// Clearings of buffers.
+    pub clears: u64,
     /// Writes to buffers from the host.
     pub uploads: u64,
     /// Submissions of command buffers.
@@ -27,7 +27,7 @@ impl std::ops::Sub for TrafficCount {
     fn sub(self, before: Self) -> Self {
         Self {
             dispatches: self.dispatches - before.dispatches,
-            copies: self.copies - before.copies,
+            clears: self.clears - before.clears,
             uploads: self.uploads - before.uploads,
             submissions: self.submissions - before.submissions,
             waits: self.waits - before.waits,
@@ -39,7 +39,7 @@ impl std::ops::Sub for TrafficCount {
 #[derive(Debug, Default)]
 pub(super) struct Traffic {
     dispatches: AtomicU64,
-    copies: AtomicU64,
+    clears: AtomicU64,
     uploads: AtomicU64,
     submissions: AtomicU64,
     waits: AtomicU64,
@@ -55,8 +55,8 @@ impl Traffic {
         add(&self.dispatches, 1);
     }
 
-    pub fn copied(&self) {
-        add(&self.copies, 1);
+    pub fn cleared(&self) {
+        add(&self.clears, 1);
     }
 
     pub fn uploaded(&self) {
@@ -79,7 +79,7 @@ impl Traffic {
         let of = |count: &AtomicU64| count.load(Ordering::Relaxed);
         TrafficCount {
             dispatches: of(&self.dispatches),
-            copies: of(&self.copies),
+            clears: of(&self.clears),
             uploads: of(&self.uploads),
             submissions: of(&self.submissions),
             waits: of(&self.waits),
@@ -100,15 +100,9 @@ impl Gpu {
         self.traffic.count()
     }
 
-    /// Copies all of one buffer to the beginning of another.
-    pub fn copy(&self, encoder: &mut wgpu::CommandEncoder, from: &GpuBuffer, to: &GpuBuffer) {
-        encoder.copy_buffer_to_buffer(from.raw(), 0, to.raw(), 0, from.size());
-        self.traffic.copied();
-    }
-
-    /// Fills a buffer with zeros.
-    pub fn clear(&self, encoder: &mut wgpu::CommandEncoder, buffer: &GpuBuffer) {
-        encoder.clear_buffer(buffer.raw(), 0, None);
-        self.traffic.copied();
+    /// Fills so many bytes of a buffer with zeros, from `offset` on; `None`: all that follow.
+    pub fn clear(&self, encoder: &mut wgpu::CommandEncoder, buffer: &GpuBuffer, offset: u64, bytes: Option<u64>) {
+        encoder.clear_buffer(buffer.raw(), offset, bytes);
+        self.traffic.cleared();
     }
 }

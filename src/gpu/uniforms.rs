@@ -32,15 +32,15 @@ impl Uniforms {
         Ok(Self { buffer, cells, bytes: Vec::with_capacity(CELL_BYTES * CELLS) })
     }
 
-    /// Whether so many more uniforms fit.
-    pub fn has_room_for(&self, uniforms: usize) -> bool {
-        self.bytes.len() / CELL_BYTES + uniforms <= CELLS
+    /// Forgets what a submission that failed has left.
+    pub fn begin(&mut self) {
+        self.bytes.clear();
     }
 
     /// Adds a uniform.
     pub fn put<T: Pod>(&mut self, value: &T) -> UniformCell {
-        assert!(std::mem::size_of::<T>() <= CELL_BYTES && self.has_room_for(1), "a submission's uniforms fit");
         let cell = self.bytes.len() / CELL_BYTES;
+        assert!(std::mem::size_of::<T>() <= CELL_BYTES && cell < CELLS, "a submission's uniforms fit");
         self.bytes.extend_from_slice(bytemuck::bytes_of(value));
         self.bytes.resize((cell + 1) * CELL_BYTES, 0);
         UniformCell(cell)
@@ -51,9 +51,8 @@ impl Uniforms {
         &self.cells[cell]
     }
 
-    /// Uploads all, to take effect before the next submission, and begins with those of the one after that.
-    pub fn upload(&mut self, gpu: &Gpu) {
+    /// Uploads all, to take effect before the next submission.
+    pub fn upload(&self, gpu: &Gpu) {
         self.buffer.write(gpu, 0, &self.bytes);
-        self.bytes.clear();
     }
 }

@@ -92,7 +92,7 @@ impl Scores {
     pub fn reserve(&mut self, gpu: &Gpu, capacity: usize) -> Result<(), GpuError> {
         if capacity == self.capacity {
             let mut encoder = gpu.device.create_command_encoder(&Default::default());
-            gpu.clear(&mut encoder, &self.scores);
+            gpu.clear(&mut encoder, &self.scores, 0, None);
             gpu.submit(encoder);
             return Ok(());
         }

@@ -211,6 +211,7 @@ impl Trainer {
             let started = Instant::now();
             let mut encoder = gpu.device.create_command_encoder(&Default::default());
             let mut pass = encoder.begin_compute_pass(&Default::default());
+            self.rasterizer.uniforms.begin();
             for view in together {
                 let viewpoint = Viewpoint { camera: &view.camera, background: [0.0; 3] };
                 let objective = Objective::Image { view: **view, loss, log: taken };
@@ -340,9 +341,10 @@ impl Trainer {
         loop {
             let mut encoder = gpu.device.create_command_encoder(&Default::default());
             if let Sink::Gradient(buffer) = sink {
-                gpu.clear(&mut encoder, buffer);
+                gpu.clear(&mut encoder, buffer, 0, None);
             }
             let mut pass = encoder.begin_compute_pass(&Default::default());
+            self.rasterizer.uniforms.begin();
             self.encode(&mut pass, cloud, viewpoint, objective, sink)?;
             drop(pass);
             self.rasterizer.uniforms.upload(&gpu);

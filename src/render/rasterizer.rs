@@ -294,6 +294,7 @@ impl Rasterizer {
     /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn render(&mut self, cloud: &GpuCloud, camera: &ViewCamera, background: [f32; 3]) -> Result<Rendered, GpuError> {
         loop {
+            self.uniforms.begin();
             let prepared = self.prepare(cloud, camera, background)?;
             let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
             self.encode_forward(&mut encoder.begin_compute_pass(&Default::default()), cloud.averages(), &prepared);

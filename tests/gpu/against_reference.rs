@@ -26,7 +26,7 @@ fn view64(camera: &ViewCamera) -> View64 {
     View64 { camera: *camera, background, cutoffs: Cutoffs::Sharp }
 }
 
-fn upload(gpu: &Gpu, cloud: &GaussianCloud) -> GpuCloud {
+pub fn upload(gpu: &Gpu, cloud: &GaussianCloud) -> GpuCloud {
     let mut on_gpu = GpuCloud::new(gpu, cloud.sh_degree, cloud.len()).unwrap();
     assert_eq!(on_gpu.append(gpu, cloud).unwrap(), 0);
     on_gpu

@@ -7,9 +7,10 @@ use image::RgbImage;
 use keysplat::gpu::{Gpu, TrafficCount};
 use keysplat::mapping::{Mapper, MappingConfig};
 use keysplat::optimise::{AdamConfig, LossConfig, TargetImage, Trainer, TrainingView};
-use keysplat::render::{BlendForm, GpuCloud};
+use keysplat::render::BlendForm;
 use keysplat::splat::ShDegree;
 
+use crate::against_reference::upload;
 use crate::common::requirements::adapter;
 use crate::mapper::keyframe;
 
@@ -28,8 +29,7 @@ fn steps_are_one_submission_with_one_upload_and_one_wait() {
     // Enough tiles that their numbers take two passes to sort.
     let camera = crate::common::camera(&mut rng, 320, 240);
     let cloud = crate::common::scene(&mut rng, 300, ShDegree::default());
-    let mut on_gpu = GpuCloud::new(&gpu, cloud.sh_degree, cloud.len()).unwrap();
-    on_gpu.append(&gpu, &cloud).unwrap();
+    let on_gpu = upload(&gpu, &cloud);
     let target = TargetImage::new(&gpu, &RgbImage::from_pixel(320, 240, image::Rgb([90, 120, 30])), None).unwrap();
     let views = [TrainingView::new(camera, &target); STEPS];
     for form in BlendForm::ALL {
@@ -38,7 +38,7 @@ fn steps_are_one_submission_with_one_upload_and_one_wait() {
         // The narrow form orders the tiles as well.
         let dispatches = if form == BlendForm::Wide { 25 } else { 26 };
         assert_eq!(traffic.dispatches, dispatches * STEPS as u64, "{form:?}");
-        assert_eq!((traffic.submissions, traffic.uploads, traffic.waits, traffic.copies), (1, 1, 1, 0), "{form:?}: {traffic:?}");
+        assert_eq!((traffic.submissions, traffic.uploads, traffic.waits, traffic.clears), (1, 1, 1, 0), "{form:?}: {traffic:?}");
         assert!(traffic.bytes_read <= 4096, "{form:?}: {traffic:?}");
     }
 }

@@ -46,7 +46,7 @@ impl GpuCloud {
             for plane in 0..self.planes() {
                 let (from, bytes) = ((plane * self.capacity + run.start) * 16, run.len() * 16);
                 for moments in [&self.moments_1, &self.moments_2] {
-                    encoder.clear_buffer(moments.raw(), from as u64, Some(bytes as u64));
+                    gpu.clear(&mut encoder, moments, from as u64, Some(bytes as u64));
                 }
             }
         }
