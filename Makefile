@@ -1,10 +1,10 @@
-# `make demo`: a map in a few minutes, without any recording. `make test`, `make check`: what the project asks of itself.
+# `make demo`: a map in a few minutes, without any recording. `make test`, `make check`: what the project asks of itself. `make gpu-static`: what compilers for GPUs make of the shaders.
 
 CARGO_HOME ?= $(HOME)/.cargo
 # Where rustup puts cargo, in case it was installed just now.
 export PATH := $(CARGO_HOME)/bin:$(PATH)
 
-.PHONY: demo test check setup build quality-fixture
+.PHONY: demo test check gpu-static setup build quality-fixture
 
 demo: build
 	target/release/keysplat demo --out out/demo
@@ -25,6 +25,9 @@ check: setup
 	RUSTDOCFLAGS="-D warnings" cargo doc --release --no-deps
 	command -v cargo-deny >/dev/null || cargo install --locked cargo-deny
 	cargo deny --locked check licenses bans sources
+
+gpu-static: setup
+	scripts/gpu-static.sh
 
 setup:
 	@scripts/setup.sh

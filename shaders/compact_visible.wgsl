@@ -20,6 +20,10 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
     let is_visible = i < view.gaussian_count && visible[min(i, view.gaussian_count - 1u)] == 1u;
     let word = local / 32u;
     let bit = 1u << (local % 32u);
+    if local < 8u {
+        atomicStore(&masks[local], 0u);
+    }
+    workgroupBarrier();
     if is_visible {
         atomicOr(&masks[word], bit);
     }

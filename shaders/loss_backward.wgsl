@@ -3,7 +3,7 @@
 
 @group(0) @binding(0) var<uniform> setup: LossSetup;
 @group(0) @binding(1) var<storage, read> color_depth: array<vec4<f32>>;
-@group(0) @binding(2) var<storage, read> state: array<vec2<f32>>;
+@group(0) @binding(2) var<storage, read> state: array<vec2<u32>>;
 @group(0) @binding(3) var<storage, read> target_color: array<u32>;
 @group(0) @binding(4) var<storage, read> target_depth: array<f32>;
 // [3 channels, bordered windows along y, along x], zero where there is no window.
@@ -56,7 +56,7 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
         var gradient_alpha = 0.0;
         let measured = target_depth[index];
         if setup.depth_weight > 0.0 && measured > 0.0 {
-            let residual = rendered[k].w - (1.0 - state[index].x) * measured;
+            let residual = rendered[k].w - (1.0 - bitcast<f32>(state[index].x)) * measured;
             gradient[k].w = sign(residual) * setup.depth_weight * depth_precision(measured) * per_pixel;
             gradient_alpha = -gradient[k].w * measured;
         }

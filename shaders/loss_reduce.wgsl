@@ -7,7 +7,7 @@ struct StepLog {
     counters: array<Counter, 2>,
 }
 
-// [tiles], see `loss_forward`.
+// [workgroups], see `loss_forward`.
 @group(0) @binding(0) var<storage, read> loss_sums: array<vec4<f32>>;
 @group(0) @binding(1) var<storage, read> counters: array<Counter>;
 @group(0) @binding(2) var<storage, read_write> log_: StepLog;

@@ -24,7 +24,8 @@ fn backward(i: u32) {
     var first = vec4(0.0);
     var second = vec4(0.0);
     let end = intersection_counts[view.capacity + 2u * i + 1u];
-    for (var slot = intersection_counts[view.capacity + 2u * i]; slot < end; slot++) {
+    // `sum_slots` has left the sums of a chunk in its first slot.
+    for (var slot = intersection_counts[view.capacity + 2u * i]; slot < end; slot = (slot / SLOT_CHUNK + 1u) * SLOT_CHUNK) {
         color_depth += intersection_gradients[slot * 3u];
         first += intersection_gradients[slot * 3u + 1u];
         second += intersection_gradients[slot * 3u + 2u];

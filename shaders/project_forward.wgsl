@@ -18,6 +18,10 @@ var<workgroup> visible_here: atomic<u32>;
 fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_index) local: u32) {
     let block = linear_workgroup(workgroup);
     let i = block * 256u + local;
+    if local == 0u {
+        atomicStore(&visible_here, 0u);
+    }
+    workgroupBarrier();
     if i < view.gaussian_count {
         let is_visible = project(i);
         visible[i] = select(0u, 1u, is_visible);

@@ -2,7 +2,7 @@
 // over a Gaussian's slots runs in a fixed order.
 //
 // This form keeps blocks of pixels in each invocation while the Gaussians pass, and sums over the tile's invocations. It suits narrow SIMD units
-// (the software adapter); `rasterize_backward_wide` suits wide ones.
+// (the software adapter); `shared/tile_stream` suits wide ones.
 
 const CHUNK: u32 = 8u;
 // [GROUP_TILES, CHUNK, 3, TILE_THREADS] what each invocation adds to each intersection of the chunk.
@@ -12,6 +12,7 @@ var<workgroup> partial: array<vec4<f32>, CHUNK * 3u * THREADS>;
 fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_index) local: u32) {
     let place = place_of(linear_workgroup(workgroup), local);
     let block = place.block;
+    clear_last(local);
     var pixels: array<PixelState, STRIPS>;
     for (var s = 0u; s < STRIPS; s++) {
         pixels[s] = load_pixels(place, s);
@@ -57,4 +58,14 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
         }
     }
     clear_unblended(place, blended);
+}
+
+// Intersections behind every pixel's last contributor were not blended.
+fn clear_unblended(place: Place, blended: u32) {
+    for (var i = place.range.x + blended + place.thread; i < place.range.y; i += TILE_THREADS) {
+        let slot = sorted_slots[i];
+        intersection_gradients[slot * 3u] = vec4(0.0);
+        intersection_gradients[slot * 3u + 1u] = vec4(0.0);
+        intersection_gradients[slot * 3u + 2u] = vec4(0.0);
+    }
 }

@@ -1,9 +1,11 @@
 // Blends the tiles' Gaussians front to back into colour, depth and transmittance (Kerbl et al. 2023, eq. 3).
 
-// [H, W] (r, g, b, Σ w z): colour over the background, depth weighted by what was blended.
+// [H, W] (r, g, b, Σ w z): colour over the background, depth weighted by what was blended. Behind it, in the wide form, checkpoints for the backward pass,
+// [buckets, 5, TILE_THREADS]: where a stretch of BUCKET Gaussians begins within a tile's list, what each strip has blended before it: red, green, blue, depth,
+// transmittance. The bucket is that of BUCKET places of the sorted list.
 @group(0) @binding(5) var<storage, read_write> color_depth: array<vec4<f32>>;
-// [H, W] (transmittance, intersections of the tile's list up to and with the last one blended).
-@group(0) @binding(6) var<storage, read_write> state: array<vec2<f32>>;
+// [H, W] (bits of the transmittance, intersections of the tile's list up to and with the last one blended).
+@group(0) @binding(6) var<storage, read_write> state: array<vec2<u32>>;
 
 var<workgroup> finished: atomic<u32>;
 // The longest list of the workgroup's tiles.
@@ -26,6 +28,11 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
     let place = place_of(linear_workgroup(workgroup), local);
     let block = place.block;
     let count = place.range.y - place.range.x;
+    if local == 0u {
+        atomicStore(&finished, 0u);
+        atomicStore(&longest, 0u);
+    }
+    workgroupBarrier();
     atomicMax(&longest, count);
     var blended: array<Blended, STRIPS>;
     for (var s = 0u; s < STRIPS; s++) {
@@ -47,6 +54,14 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
         workgroupBarrier();
         if workgroupUniformLoad(&finished) == THREADS {
             break;
+        }
+        if STRIPS == 1u && start > 0u && start % BUCKET == 0u {
+            let to = view.width * view.height + (place.range.x + start) / BUCKET * 5u * TILE_THREADS + place.thread;
+            color_depth[to] = blended[0].red;
+            color_depth[to + TILE_THREADS] = blended[0].green;
+            color_depth[to + 2u * TILE_THREADS] = blended[0].blue;
+            color_depth[to + 3u * TILE_THREADS] = blended[0].depth;
+            color_depth[to + 4u * TILE_THREADS] = blended[0].transmittance;
         }
         load_batch(place, start, count);
         workgroupBarrier();
@@ -73,7 +88,7 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
                 let at = block.first + s * view.width + p;
                 let color = vec3(done.red[p], done.green[p], done.blue[p]) + done.transmittance[p] * view.background.xyz;
                 color_depth[at] = vec4(color, done.depth[p]);
-                state[at] = vec2(done.transmittance[p], bitcast<f32>(done.last[p]));
+                state[at] = vec2(bitcast<u32>(done.transmittance[p]), done.last[p]);
             }
         }
     }

@@ -53,6 +53,8 @@ fn exclusive_sum(local: u32, value: u32) -> u32 {
 fn count_digits(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_index) local: u32) {
     let block = linear_workgroup(workgroup);
     let count = counters[setup.counter].count;
+    atomicStore(&digit_counts[local], 0u);
+    workgroupBarrier();
     for (var k = local; k < SORT_BLOCK; k += 256u) {
         let i = block * SORT_BLOCK + k;
         if i < count {
@@ -88,6 +90,9 @@ fn scatter(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocatio
     let count = counters[setup.counter].count;
     if block * SORT_BLOCK >= count {
         return;
+    }
+    for (var k = local; k < 512u; k += 64u) {
+        atomicStore(&masks[k], 0u);
     }
     find_bases(block, block_count(count), local);
     let word = local / 32u;

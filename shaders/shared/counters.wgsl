@@ -8,6 +8,8 @@ struct Counter {
     per_element: array<u32, 3>,
     // Indirect dispatch with one workgroup per SORT_BLOCK elements.
     per_block: array<u32, 3>,
+    // Indirect dispatch with one workgroup per stretch of BUCKET Gaussians of a tile's list, or somewhat more.
+    per_bucket: array<u32, 3>,
 }
 
 fn dispatch_of(workgroups: u32) -> array<u32, 3> {

@@ -3,9 +3,9 @@
 // Front to back, as the forward pass goes: with w = αT, v·g = colour·g_colour + depth·g_depth and R the share of the pixel's value
 // behind the Gaussian, ∂L/∂α = T(v·g) - R/(1-α). T is never recovered by division.
 
-// [H, W] rendered (r, g, b, Σ w z) and (transmittance, last).
+// [H, W] rendered (r, g, b, Σ w z) and (bits of the transmittance, last).
 @group(0) @binding(5) var<storage, read> color_depth: array<vec4<f32>>;
-@group(0) @binding(6) var<storage, read> state: array<vec2<f32>>;
+@group(0) @binding(6) var<storage, read> state: array<vec2<u32>>;
 // [2, H, W] gradients of the loss: plane 0 (r, g, b, Σ w z), plane 1 (alpha, |error|, -, -).
 @group(0) @binding(7) var<storage, read> image_gradients: array<vec4<f32>>;
 // [intersections, 3] see `IntersectionGradient`.
@@ -54,9 +54,9 @@ fn load_pixels(place: Place, strip: u32) -> PixelState {
         pixels.green[p] = gradient.y;
         pixels.blue[p] = gradient.z;
         pixels.depth[p] = gradient.w;
-        pixels.last[p] = bitcast<u32>(final_state.y);
+        pixels.last[p] = final_state.y;
         // Behind the first Gaussian lies everything blended, the background (it is in `rendered`) and, as alpha is 1 - T, its gradient.
-        pixels.behind[p] = dot(rendered, gradient) - final_state.x * gradient_alpha;
+        pixels.behind[p] = dot(rendered, gradient) - bitcast<f32>(final_state.x) * gradient_alpha;
     }
     let last = max(max(pixels.last.x, pixels.last.y), max(pixels.last.z, pixels.last.w));
     atomicMax(&tile_last[place.member], last);
@@ -121,12 +121,13 @@ fn before_clamp(color: vec4<f32>, gradient: vec4<f32>) -> vec4<f32> {
     return select(vec4(0.0), gradient, vec4(color.xyz > vec3(0.0), true));
 }
 
-// Intersections behind every pixel's last contributor were not blended.
-fn clear_unblended(place: Place, blended: u32) {
-    for (var i = place.range.x + blended + place.thread; i < place.range.y; i += TILE_THREADS) {
-        let slot = sorted_slots[i];
-        intersection_gradients[slot * 3u] = vec4(0.0);
-        intersection_gradients[slot * 3u + 1u] = vec4(0.0);
-        intersection_gradients[slot * 3u + 2u] = vec4(0.0);
+// Before the pixels are loaded: workgroup memory holds anything.
+fn clear_last(local: u32) {
+    if local < GROUP_TILES {
+        atomicStore(&tile_last[local], 0u);
     }
+    if local == 0u {
+        atomicStore(&longest, 0u);
+    }
+    workgroupBarrier();
 }

@@ -175,7 +175,7 @@ fn floors(work: &Work, bench: &StepBench, rates: &Rates) -> BTreeMap<&'static st
     let [n, visible, intersections, pixels] = [work.gaussians, work.visible, work.intersections, work.pixels].map(|v| v as f64);
     let (evaluations, blended, back) = (work.evaluations as f64, work.blended as f64, work.backward_evaluations as f64);
     let floor = |bytes: f64, flops: f64| 1e3 * (bytes / rates.bytes_per_s).max(flops / rates.flops_per_s);
-    let (depth_passes, tile_passes) = (4.0, if work.tiles < 256 { 1.0 } else { 2.0 });
+    let (depth_passes, tile_passes) = (2.0, if work.tiles < 256 { 1.0 } else { 2.0 });
     let planes = 3.0 + coefficients;
     // Separable 11-tap filters for a quarter of the windows: half of the columns in half of the rows, then half of these rows; five quantities
     // forward, three backward, on three channels.
@@ -184,7 +184,7 @@ fn floors(work: &Work, bench: &StepBench, rates: &Rates) -> BTreeMap<&'static st
         ("project_forward", floor(n * (16.0 * (2.0 + coefficients) + 20.0) + visible * 64.0, n * 150.0)),
         ("sort_count_digits", floor(4.0 * (depth_passes * visible + tile_passes * intersections), 0.0)),
         ("sort_scatter", floor(16.0 * (depth_passes * visible + tile_passes * intersections), 0.0)),
-        ("tile_lists", floor(visible * 2.0 * 40.0 + intersections * 12.0, 2.0 * intersections * 40.0)),
+        (bench.form.lists_stage(), floor(visible * 2.0 * 40.0 + intersections * 12.0, 2.0 * intersections * 40.0)),
         ("tile_ranges", floor(intersections * 4.0, 0.0)),
         ("rasterize_forward", floor(intersections * 56.0 + pixels * 24.0, evaluations * 11.0 + blended * 24.0)),
         ("loss_forward", floor(pixels * (20.0 + 12.0 + 12.0), taps * 5.0)),

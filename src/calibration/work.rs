@@ -3,6 +3,7 @@
 use rayon::prelude::*;
 use serde::Serialize;
 
+use super::lanes::{Lanes, count_lanes};
 use crate::gpu::GpuError;
 use crate::optimise::Trainer;
 use crate::render::layout::{TILE_HEIGHT, TILE_WIDTH};
@@ -29,6 +30,8 @@ pub struct Work {
     pub pixels: u64,
     /// Tiles of the image.
     pub tiles: u64,
+    /// How evenly the lanes of a GPU share it.
+    pub lanes: Lanes,
 }
 
 #[derive(Clone, Copy, Default)]
@@ -79,6 +82,7 @@ pub fn count_work(trainer: &mut Trainer, cloud: &GpuCloud, camera: &ViewCamera) 
         backward_evaluations: sum(|t| t.backward_evaluations),
         pixels: u64::from(width * height),
         tiles: u64::from(tiles),
+        lanes: count_lanes(rasterizer, cloud, counts, height.div_ceil(TILE_HEIGHT))?,
     })
 }
 

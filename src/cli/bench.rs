@@ -217,6 +217,9 @@ fn print(r: &StepReport) {
         "  visible {}   intersections {}   evaluations {}   blended {}",
         w.visible, w.intersections, w.evaluations, w.blended
     );
+    for (stage, lanes) in [("lists", w.lanes.lists), ("slot sums", w.lanes.slot_sums)] {
+        println!("  {stage}: lane efficiency {:.2}, longest lane {}", lanes.efficiency(), lanes.longest);
+    }
     for stage in &r.stages {
         println!("  {:<24}{:>9.3} ms   floor {:>8.3} ms", stage.stage, stage.ms, stage.floor_ms);
     }

@@ -64,8 +64,8 @@ impl Kernel {
             module: &module,
             entry_point: Some(entry_point),
             compilation_options: wgpu::PipelineCompilationOptions {
-                // Counts and masks in workgroup memory start from zero.
-                zero_initialize_workgroup_memory: true,
+                // Shaders clear what has to start from zero: on Metal and DX12 one invocation would clear all of it.
+                zero_initialize_workgroup_memory: false,
                 ..Default::default()
             },
             cache: None,

@@ -2,7 +2,6 @@
 
 use super::loss::{GpuPixels, Pixels, TargetImage};
 use crate::gpu::{Gpu, GpuBuffer, GpuError};
-use crate::render::layout::{TILE_HEIGHT, TILE_WIDTH};
 
 /// Pixels along a side of what one workgroup of the loss shaders covers.
 pub(super) const LOSS_TILE: u32 = 16;
@@ -24,13 +23,13 @@ pub(super) struct ImageBuffers {
     streamed: Option<GpuPixels>,
     pub partials: GpuBuffer,
     pub gradients: GpuBuffer,
-    /// [tiles]; its length is the number of terms that are summed.
+    /// [workgroups]; its length is the number of terms that are summed.
     pub loss_sums: GpuBuffer,
 }
 
 impl ImageBuffers {
     fn new(gpu: &Gpu, (width, height): (u32, u32)) -> Result<Self, GpuError> {
-        let tiles = width.div_ceil(TILE_WIDTH) * height.div_ceil(TILE_HEIGHT);
+        let tiles = width.div_ceil(LOSS_TILE) * height.div_ceil(LOSS_TILE);
         Ok(Self {
             size: (width, height),
             streamed: None,

@@ -9,6 +9,7 @@ pub(super) struct Kernels {
     pub loss_reduce: Kernel,
     pub loss_backward: Kernel,
     pub rasterize_backward: Kernel,
+    pub sum_slots: Kernel,
     pub project_backward: Kernel,
     pub project_backward_adam: Kernel,
 }
@@ -26,6 +27,7 @@ impl Kernels {
                 BlendForm::Wide => &shaders::RASTERIZE_BACKWARD_WIDE,
                 BlendForm::Narrow => &shaders::RASTERIZE_BACKWARD_NARROW,
             }),
+            sum_slots: kernel(&shaders::SUM_SLOTS),
             project_backward: kernel(&shaders::PROJECT_BACKWARD),
             project_backward_adam: kernel(&shaders::PROJECT_BACKWARD_ADAM),
         }

@@ -3,7 +3,7 @@
 use super::LossConfig;
 use crate::gpu::{Gpu, GpuBuffer, GpuError, IndirectSize, Kernel, Part, ReadBack, UniformCell};
 use crate::render::layout::{Counter, ScoreSetup, VISIBLE_COUNTER};
-use crate::render::{GaussianGeometry, GpuCloud, PreparedView, Rasterizer, shaders};
+use crate::render::{BlendForm, GaussianGeometry, GpuCloud, PreparedView, Rasterizer, shaders};
 
 /// Definition of an error pixel (the high-error mask of FastGS).
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -76,7 +76,10 @@ impl Scores {
         let (gpu, form) = (rasterizer.gpu(), rasterizer.form());
         let kernel = |source: &shaders::ShaderSource| Kernel::new(gpu, source.name, "main", &source.text(form));
         Ok(Self {
-            rasterize: kernel(&shaders::RASTERIZE_SCORES),
+            rasterize: kernel(match form {
+                BlendForm::Wide => &shaders::RASTERIZE_SCORES_WIDE,
+                BlendForm::Narrow => &shaders::RASTERIZE_SCORES_NARROW,
+            }),
             gather: kernel(&shaders::GATHER_SCORES),
             scores: GpuBuffer::storage(gpu, "scores", 16)?,
             capacity: 0,
@@ -116,20 +119,8 @@ impl Scores {
     ) {
         let (gpu, ws) = (rasterizer.gpu(), &rasterizer.workspace);
         let (view, setup) = (rasterizer.view(prepared), rasterizer.uniforms.of(setup));
-        let rasterize = [
-            (0, view),
-            (1, &ws.ranges),
-            (2, &ws.slots[prepared.sorted]),
-            (3, &ws.slot_gaussians),
-            (4, &ws.projected),
-            (5, &ws.color_depth),
-            (6, &ws.state),
-            (7, image.gradients),
-            (8, &ws.intersection_gradients),
-            (9, setup),
-            (10, image.log),
-        ];
-        self.rasterize.dispatch(gpu, pass, &rasterize, rasterizer.form().workgroups(prepared.view.tiles()));
+        let rasterize = [(7, image.gradients), (8, &ws.intersection_gradients), (9, setup), (10, image.log)];
+        rasterizer.encode_over_lists(pass, prepared, &self.rasterize, &rasterize);
         let gather = [
             (0, view),
             (1, &ws.counters),

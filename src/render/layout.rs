@@ -17,6 +17,8 @@ pub const LIST_PARTS: u32 = 16;
 pub const SORT_BLOCK: u32 = 1024;
 /// Blocks whose digit counts one workgroup scans.
 pub const SORT_CHUNK: u32 = 64;
+/// Gaussians of a tile's list that one workgroup takes in the wide form's backward pass.
+pub const BUCKET: u32 = 128;
 /// Counters in the counter buffer.
 pub const VISIBLE_COUNTER: u32 = 0;
 /// Counter of tile intersections.
@@ -44,9 +46,10 @@ impl BlendForm {
     /// Both forms.
     pub const ALL: [Self; 2] = [Self::Wide, Self::Narrow];
 
-    /// The faster form on this adapter.
+    /// The faster form on this adapter. SwiftShader, though software, takes the wide one: its compiler needs 24 GB for the narrow one.
     pub fn of(gpu: &Gpu) -> Self {
-        if gpu.is_software() { Self::Narrow } else { Self::Wide }
+        let is_swiftshader = gpu.adapter.name.to_lowercase().contains("swiftshader");
+        if gpu.is_software() && !is_swiftshader { Self::Narrow } else { Self::Wide }
     }
 
     /// Name of the stage that blends backward in this form.
@@ -57,11 +60,36 @@ impl BlendForm {
         }
     }
 
+    /// Name of the stage that lists tiles in this form.
+    pub fn lists_stage(self) -> &'static str {
+        match self {
+            Self::Wide => "tile_lists_wide",
+            Self::Narrow => "tile_lists_narrow",
+        }
+    }
+
     /// Strips of 4×1 pixels per invocation.
     fn strips(self) -> u32 {
         match self {
             Self::Wide => 1,
             Self::Narrow => 8,
+        }
+    }
+
+    /// Intersections of a Gaussian that are summed before its own turn comes. Where lanes are few, one Gaussian's many intersections keep
+    /// few others waiting, and a pass of its own costs more.
+    pub(crate) fn slot_chunk(self) -> u32 {
+        match self {
+            Self::Wide => 16,
+            Self::Narrow => 1,
+        }
+    }
+
+    /// Bytes of the forward pass' checkpoints for so many intersections: colour, depth and transmittance of a tile's pixels each.
+    pub(crate) fn checkpoint_bytes(self, intersections: usize) -> u64 {
+        match self {
+            Self::Wide => (intersections as u64 / u64::from(BUCKET) + 1) * u64::from(TILE_WIDTH * TILE_HEIGHT) * 20,
+            Self::Narrow => 0,
         }
     }
 
@@ -103,6 +131,8 @@ pub fn wgsl_constants(form: BlendForm) -> String {
         ("SORT_BLOCK", SORT_BLOCK),
         ("DEPTH_KEY_STEP", DEPTH_KEY_STEP),
         ("SORT_CHUNK", SORT_CHUNK),
+        ("BUCKET", BUCKET),
+        ("SLOT_CHUNK", form.slot_chunk()),
         ("VISIBLE_COUNTER", VISIBLE_COUNTER),
         ("INTERSECTION_COUNTER", INTERSECTION_COUNTER),
     ];
@@ -160,6 +190,11 @@ impl Counter {
     /// Byte offset of a counter's indirect arguments with one workgroup per sort block.
     pub const fn per_block_offset(counter: u32) -> u64 {
         counter as u64 * Self::SIZE + 20
+    }
+
+    /// Byte offset of a counter's indirect arguments with one workgroup per stretch of a tile's list.
+    pub const fn per_bucket_offset(counter: u32) -> u64 {
+        counter as u64 * Self::SIZE + 32
     }
 }
 
@@ -225,6 +260,8 @@ host_twins! {
         per_element: [u32; 3],
         /// Workgroups for one sorting block a workgroup.
         per_block: [u32; 3],
+        /// Workgroups for one stretch of a tile's list a workgroup.
+        per_bucket: [u32; 3],
     }
     /// Which of the two prefix sums (`shaders/scan_blocks.wgsl`).
     ScanSetup {
@@ -239,6 +276,8 @@ host_twins! {
         loss: [f32; 4],
         /// Work of the view.
         counters: [Counter; COUNTERS as usize],
+        /// Unused.
+        pad: [u32; 2],
     }
     /// One digit of a radix sort (`shaders/sort.wgsl`).
     SortSetup {
@@ -249,7 +288,7 @@ host_twins! {
         /// Unused.
         pad: [u32; 2],
     }
-    /// Mode of `shaders/tile_lists.wgsl`.
+    /// Mode of `shaders/shared/tile_rows.wgsl`.
     TileListsSetup {
         /// 0 counts tile intersections, 1 writes them.
         emit: u32,
@@ -294,7 +333,7 @@ host_twins! {
         /// Factor from the recorded blue to the map's.
         blue_gain: f32,
     }
-    /// High-error mask (`shaders/rasterize_scores.wgsl`).
+    /// High-error mask (`shaders/shared/tile_scores.wgsl`).
     ScoreSetup {
         /// Factor of the mean absolute error above which a pixel is a high-error one.
         error_ratio: f32,
@@ -339,6 +378,8 @@ mod tests {
     #[test]
     fn indirect_offsets_point_into_the_struct() {
         assert_eq!(std::mem::offset_of!(Counter, per_element) as u64, Counter::per_element_offset(0));
-        assert_eq!(std::mem::offset_of!(Counter, per_block) as u64 + 32, Counter::per_block_offset(1));
+        let size = std::mem::size_of::<Counter>() as u64;
+        assert_eq!(std::mem::offset_of!(Counter, per_block) as u64 + size, Counter::per_block_offset(1));
+        assert_eq!(std::mem::offset_of!(Counter, per_bucket) as u64 + size, Counter::per_bucket_offset(1));
     }
 }

@@ -113,7 +113,10 @@ impl Rasterizer {
         let kernels = Kernels {
             project_forward: kernel(&shaders::PROJECT_FORWARD),
             compact_visible: kernel(&shaders::COMPACT_VISIBLE),
-            tile_lists: kernel(&shaders::TILE_LISTS),
+            tile_lists: kernel(match form {
+                BlendForm::Wide => &shaders::TILE_LISTS_WIDE,
+                BlendForm::Narrow => &shaders::TILE_LISTS_NARROW,
+            }),
             tile_ranges: kernel(&shaders::TILE_RANGES),
             order_tiles: kernel(&shaders::ORDER_TILES),
             rasterize_forward: kernel(&shaders::RASTERIZE_FORWARD),
@@ -130,7 +133,7 @@ impl Rasterizer {
             visible_scan: scan("visible scan", VISIBLE_COUNTER)?,
             intersection_scan: scan("intersection scan", INTERSECTION_COUNTER)?,
             uniforms: Uniforms::new(&gpu)?,
-            workspace: Workspace::new(&gpu)?,
+            workspace: Workspace::new(&gpu, form)?,
             gpu,
         })
     }
@@ -184,6 +187,36 @@ impl Rasterizer {
     /// Which of `workspace.slots` holds the sorted intersections of a view of so many tiles.
     pub(crate) fn sorted(tiles: u32) -> usize {
         Sort::result_of(tile_bits(tiles))
+    }
+
+    /// Encodes a pass over the sorted tile lists, front to back, from which the wide form takes stretches.
+    pub(crate) fn encode_over_lists(
+        &self,
+        pass: &mut wgpu::ComputePass<'_>,
+        prepared: &PreparedView,
+        kernel: &Kernel,
+        bindings: &[(u32, &GpuBuffer)],
+    ) {
+        let (gpu, ws) = (&*self.gpu, &self.workspace);
+        let lists = [
+            (0, self.view(prepared)),
+            (1, &ws.ranges),
+            (2, &ws.slots[prepared.sorted]),
+            (3, &ws.slot_gaussians),
+            (4, &ws.projected),
+            (5, &ws.color_depth),
+            (6, &ws.state),
+        ];
+        let bindings = lists.iter().chain(bindings).copied();
+        match self.form {
+            BlendForm::Wide => {
+                let size = IndirectSize { buffer: &ws.counters, offset: Counter::per_bucket_offset(INTERSECTION_COUNTER) };
+                kernel.dispatch_indirect(gpu, pass, &bindings.collect::<Vec<_>>(), size);
+            }
+            BlendForm::Narrow => {
+                kernel.dispatch(gpu, pass, &bindings.collect::<Vec<_>>(), self.form.workgroups(prepared.view.tiles()));
+            }
+        }
     }
 
     /// Encodes the forward pass over a map's parameters or their averages.
@@ -303,11 +336,11 @@ impl Rasterizer {
             let parts = [
                 ws.counters.part::<Counter>(0, COUNTERS as usize),
                 ws.color_depth.part::<[f32; 4]>(0, pixels),
-                ws.state.part::<[f32; 2]>(0, pixels),
+                ws.state.part::<[u32; 2]>(0, pixels),
             ];
             let read = self.gpu.read(Some(encoder), &parts)?;
             let counters: Vec<Counter> = read.part(0);
-            let (color_depth, state) = (read.part(1), read.part::<[f32; 2]>(2));
+            let (color_depth, state) = (read.part(1), read.part::<[u32; 2]>(2));
             drop(read);
             if self.counts(&counters).is_none() {
                 self.reserve_for(&counters)?;
@@ -317,7 +350,7 @@ impl Rasterizer {
                 width: prepared.view.width,
                 height: prepared.view.height,
                 color_depth,
-                transmittance: state.iter().map(|s| s[0]).collect(),
+                transmittance: state.iter().map(|s| f32::from_bits(s[0])).collect(),
             });
         }
     }

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::layout::{COUNTERS, Counter, SORT_BLOCK, SORT_CHUNK};
+use super::layout::{BlendForm, COUNTERS, Counter, SORT_BLOCK, SORT_CHUNK};
 use crate::gpu::{Gpu, GpuBuffer, GpuError};
 
 /// Bytes of one intersection's gradient: three vec4.
@@ -11,6 +11,7 @@ const INTERSECTION_GRADIENT_BYTES: u64 = 48;
 /// Scratch that one rendered view leaves behind for its backward pass. Sizes only grow.
 #[derive(Debug)]
 pub(crate) struct Workspace {
+    form: BlendForm,
     pub(crate) counters: GpuBuffer,
     // Per Gaussian.
     pub(crate) capacity: usize,
@@ -20,7 +21,7 @@ pub(crate) struct Workspace {
     pub(super) block_sums: GpuBuffer,
     pub(super) depth_keys: [GpuBuffer; 2],
     /// Visible Gaussians, nearest first, in `[0]` after the depth sort.
-    pub(super) order: [GpuBuffer; 2],
+    pub(crate) order: [GpuBuffer; 2],
     /// Per visible Gaussian its intersections, nearest first; then per Gaussian where its slots begin and end; then the visible ones in map order.
     pub(crate) intersection_counts: GpuBuffer,
     // Per intersection.
@@ -34,6 +35,7 @@ pub(crate) struct Workspace {
     pixels: u32,
     tiles: u32,
     pub(crate) ranges: GpuBuffer,
+    /// The image, then the checkpoints of its tiles.
     pub(crate) color_depth: GpuBuffer,
     pub(crate) state: GpuBuffer,
 }
@@ -48,10 +50,11 @@ pub struct Capacities {
 }
 
 impl Workspace {
-    pub(super) fn new(gpu: &Gpu) -> Result<Self, GpuError> {
+    pub(super) fn new(gpu: &Gpu, form: BlendForm) -> Result<Self, GpuError> {
         let (capacity, intersection_capacity) = (16_384, 131_072);
         let empty = |label: &str| GpuBuffer::storage(gpu, label, 16);
         let mut workspace = Self {
+            form,
             counters: GpuBuffer::storage(gpu, "counters", u64::from(COUNTERS) * std::mem::size_of::<Counter>() as u64)?,
             capacity: 0,
             projected: empty("projected")?,
@@ -119,6 +122,7 @@ impl Workspace {
         self.slot_gaussians = words("slot Gaussians")?;
         self.intersection_gradients =
             GpuBuffer::storage(gpu, "intersection gradients", capacity as u64 * INTERSECTION_GRADIENT_BYTES)?;
+        self.color_depth = self.rendered(gpu, self.pixels, capacity)?;
         self.intersection_capacity = capacity;
         self.reserve_histogram(gpu)
     }
@@ -135,10 +139,14 @@ impl Workspace {
             self.tiles = tiles;
         }
         if pixels > self.pixels {
-            self.color_depth = GpuBuffer::storage(gpu, "rendered", u64::from(pixels) * 16)?;
+            self.color_depth = self.rendered(gpu, pixels, self.intersection_capacity)?;
             self.state = GpuBuffer::storage(gpu, "rendered state", u64::from(pixels) * 8)?;
             self.pixels = pixels;
         }
         Ok(())
+    }
+
+    fn rendered(&self, gpu: &Gpu, pixels: u32, intersections: usize) -> Result<GpuBuffer, GpuError> {
+        GpuBuffer::storage(gpu, "rendered", u64::from(pixels) * 16 + self.form.checkpoint_bytes(intersections))
     }
 }

@@ -5,7 +5,7 @@ use crate::gpu::{GpuBuffer, IndirectSize, UniformCell};
 use crate::optimise::LossConfig;
 use crate::optimise::image_buffers::LOSS_TILE;
 use crate::optimise::loss::{GpuPixels, ssim_phase};
-use crate::render::layout::{Counter, LossSetup, VISIBLE_COUNTER};
+use crate::render::layout::{Counter, INTERSECTION_COUNTER, LossSetup, VISIBLE_COUNTER};
 use crate::render::{GpuCloud, PreparedView};
 
 /// Uniforms of a step beside its view.
@@ -53,8 +53,7 @@ impl Trainer {
     ) {
         let (gpu, ws, k) = (self.rasterizer.gpu(), &self.rasterizer.workspace, &self.kernels);
         let (width, height) = (prepared.view.width, prepared.view.height);
-        let forward = [width.div_ceil(LOSS_TILE), height.div_ceil(LOSS_TILE / 2), 1];
-        let backward = [width.div_ceil(LOSS_TILE), height.div_ceil(LOSS_TILE), 1];
+        let size = [width.div_ceil(LOSS_TILE), height.div_ceil(LOSS_TILE), 1];
         let inputs = [
             (0, self.rasterizer.uniforms.of(setup)),
             (1, &ws.color_depth),
@@ -65,9 +64,9 @@ impl Trainer {
         ];
         let loss_sums = &self.images[0].loss_sums;
         let with = |last| inputs.iter().copied().chain([last]).collect::<Vec<_>>();
-        k.loss_forward.dispatch(gpu, pass, &with((6, loss_sums)), forward);
+        k.loss_forward.dispatch(gpu, pass, &with((6, loss_sums)), size);
         k.loss_reduce.dispatch(gpu, pass, &[(0, loss_sums), (1, &ws.counters), (2, log)], [1, 1, 1]);
-        k.loss_backward.dispatch(gpu, pass, &with((6, &self.images[0].gradients)), backward);
+        k.loss_backward.dispatch(gpu, pass, &with((6, &self.images[0].gradients)), size);
     }
 
     pub(super) fn encode_backward(
@@ -83,18 +82,13 @@ impl Trainer {
         };
         let (gpu, ws, k) = (self.rasterizer.gpu(), &self.rasterizer.workspace, &self.kernels);
         let view = self.rasterizer.view(prepared);
-        let blend = [
-            (0, view),
-            (1, &ws.ranges),
-            (2, &ws.slots[prepared.sorted]),
-            (3, &ws.slot_gaussians),
-            (4, &ws.projected),
-            (5, &ws.color_depth),
-            (6, &ws.state),
-            (7, &self.images[0].gradients),
-            (8, &ws.intersection_gradients),
-        ];
-        k.rasterize_backward.dispatch(gpu, pass, &blend, self.rasterizer.form().workgroups(prepared.view.tiles()));
+        let blend = [(7, &self.images[0].gradients), (8, &ws.intersection_gradients)];
+        self.rasterizer.encode_over_lists(pass, prepared, &k.rasterize_backward, &blend);
+        if self.rasterizer.form().slot_chunk() > 1 {
+            let slots = [(0, &ws.counters), (1, &ws.slot_gaussians), (2, &ws.intersection_gradients)];
+            let size = IndirectSize { buffer: &ws.counters, offset: Counter::per_block_offset(INTERSECTION_COUNTER) };
+            k.sum_slots.dispatch_indirect(gpu, pass, &slots, size);
+        }
         let project = [
             (0, view),
             (1, &ws.counters),

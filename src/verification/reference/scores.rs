@@ -1,4 +1,4 @@
-//! What a view says of each Gaussian, by its definition; twin of `shaders/rasterize_scores.wgsl` and `shaders/gather_scores.wgsl`.
+//! What a view says of each Gaussian, by its definition; twin of `shaders/shared/tile_scores.wgsl` and `shaders/gather_scores.wgsl`.
 
 use nalgebra::Vector2;
 

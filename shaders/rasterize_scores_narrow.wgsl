@@ -1,28 +1,4 @@
-// What each (Gaussian, tile) intersection does to the pixels that it was really blended into, written over the intersection's gradient, whose turn comes
-// after: the raw material of density control (FastGS, arXiv 2511.04283; absolute gradients after AbsGS, arXiv 2404.10484).
-//
-// An error pixel is one whose error exceeds a multiple of the view's mean error, and the noise of the sensor: one hot pixel
-// does not rescale the mask, and a view that is good already has few.
-
-struct ScoreSetup {
-    // Multiple of the mean absolute error above which a pixel is an error pixel; and the error below which none is.
-    error_ratio: f32,
-    noise: f32,
-    ssim_weight: f32,
-    pixels: f32,
-}
-
-@group(0) @binding(9) var<uniform> setup: ScoreSetup;
-// (Σ|colour error|, Σ SSIM, -, -) over the view's pixels and channels.
-@group(0) @binding(10) var<uniform> total: vec4<f32>;
-
-// Of a intersection, over the pixels of its tile.
-struct PairScore {
-    // (error pixels, Σ w, largest w, 0), w what the Gaussian adds to a pixel.
-    seen: vec4<f32>,
-    // By the image mean, in pixels: (Σ ∂x, Σ ∂y, Σ|∂x|, Σ|∂y|).
-    gradient: vec4<f32>,
-}
+// The scores of `shared/tile_scores`, summed as `rasterize_backward_narrow` sums its gradients.
 
 const CHUNK: u32 = 8u;
 // [GROUP_TILES, CHUNK, 2, TILE_THREADS] what each invocation adds to each intersection of the chunk.
@@ -32,7 +8,8 @@ var<workgroup> partial: array<vec4<f32>, CHUNK * 2u * THREADS>;
 fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_index) local: u32) {
     let place = place_of(linear_workgroup(workgroup), local);
     let block = place.block;
-    let threshold = max(setup.noise, setup.error_ratio * total.x / (3.0 * setup.pixels));
+    clear_last(local);
+    let threshold = error_threshold();
     var pixels: array<PixelState, STRIPS>;
     var is_error: array<vec4<f32>, STRIPS>;
     for (var s = 0u; s < STRIPS; s++) {
@@ -87,40 +64,11 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
     clear_unblended(place, blended);
 }
 
-// 1 where the error of a strip's pixel exceeds the threshold.
-fn error_pixels(place: Place, strip: u32, threshold: f32) -> vec4<f32> {
-    let errors = view.width * view.height + place.block.first + strip * view.width;
-    var is_error = vec4(0.0);
-    for (var p = 0u; p < 4u; p++) {
-        if place.block.columns[p] && strip < place.block.rows && image_gradients[errors + p].y > threshold {
-            is_error[p] = 1.0;
-        }
+// Intersections behind every pixel's last contributor were not blended.
+fn clear_unblended(place: Place, blended: u32) {
+    for (var i = place.range.x + blended + place.thread; i < place.range.y; i += TILE_THREADS) {
+        let slot = sorted_slots[i];
+        intersection_gradients[slot * 3u] = vec4(0.0);
+        intersection_gradients[slot * 3u + 1u] = vec4(0.0);
     }
-    return is_error;
-}
-
-// Takes a strip past one Gaussian as `add_gradient` does, and adds to its score.
-fn add_score(
-    dx: vec4<f32>,
-    dy: f32,
-    mean: vec4<f32>,
-    shape: vec4<f32>,
-    color: vec4<f32>,
-    position: u32,
-    is_error: vec4<f32>,
-    pixels: ptr<function, PixelState>,
-    sum: ptr<function, PairScore>,
-) {
-    let u = shape.x * dx + shape.y * dy;
-    let v = shape.z * dy;
-    let passed = pass_gaussian(u, v, mean, shape.w, color, position, pixels);
-    let weight = passed.weight;
-    let by_x = 2.0 * passed.q * shape.x * u;
-    let by_y = 2.0 * passed.q * (shape.y * u + shape.z * v);
-    let ones = vec4(1.0);
-    let blended = select(vec4(0.0), is_error, passed.hit);
-    let largest = max(max(weight.x, weight.y), max(weight.z, weight.w));
-    let before = (*sum).seen;
-    (*sum).seen = vec4(before.x + dot(blended, ones), before.y + dot(weight, ones), max(before.z, largest), 0.0);
-    (*sum).gradient += vec4(dot(by_x, ones), dot(by_y, ones), dot(abs(by_x), ones), dot(abs(by_y), ones));
 }
