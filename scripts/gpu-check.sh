@@ -1,6 +1,6 @@
 #!/bin/sh
 # Checks and measures keysplat on the machine it runs on, in one command: the GPU against the oracle, two runs of the demo that must give
-# the same map, then the training step's stages as JSON in the folder $1 (default benches/results), named after the adapter. Further
+# the same map, then the training step's stages and the mapping thread's own time as JSON in the folder $1 (default benches/results), named after the adapter. Further
 # arguments go to `keysplat bench step`. Builds where there is a Rust toolchain, else uses the
 # build that was carried along in target/release (`cargo test --release --no-run && cargo build --release` makes it).
 set -eu
@@ -32,3 +32,4 @@ fi
 adapter=$(target/release/keysplat adapters 2>/dev/null | head -n 1 | sed 's/  \[.*//; s/[^A-Za-z0-9]\{1,\}/-/g; s/-$//' | tr '[:upper:]' '[:lower:]')
 [ $# -eq 0 ] || shift
 target/release/keysplat bench step --out "$out/step-$adapter.json" "$@"
+target/release/keysplat bench host --out "$out/host-$adapter.json"

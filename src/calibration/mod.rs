@@ -1,12 +1,14 @@
 //! Calibration on the adapter at hand: times of the training step, stage by stage, beside the floor that the adapter's own
 //! bandwidth and arithmetic set for the work really done.
 
+mod host;
 mod lanes;
 mod rates;
 mod scene;
 mod step;
 mod work;
 
+pub use host::{HostBench, HostReport, bench_host};
 pub use lanes::{LaneUse, Lanes};
 pub use rates::{Rates, measure_rates};
 pub use scene::BenchScene;

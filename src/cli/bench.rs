@@ -1,6 +1,7 @@
 //! `keysplat bench`
 
 mod ablation;
+mod host;
 mod sweep;
 
 use std::path::{Path, PathBuf};
@@ -29,6 +30,8 @@ pub struct BenchArgs {
 enum What {
     /// One training step, on made-up scenes or on the map of a run, stage by stage, beside what the adapter could do at its best.
     Step(StepArgs),
+    /// CPU time of the mapping thread for a keyframe by part, and what passes between it and the adapter.
+    Host(host::HostArgs),
     /// Mappers with different settings on the same keyframes of a recording: time, Gaussians, held-out quality.
     Ablation(ablation::AblationArgs),
     /// Whole runs over sequences, numbers of steps and seeds: what time buys, as table and curves.
@@ -105,6 +108,7 @@ struct Report {
 pub fn bench(args: &BenchArgs, verbosity: Verbosity) -> miette::Result<()> {
     match &args.what {
         What::Step(args) => step(args),
+        What::Host(args) => host::host(args),
         What::Ablation(args) => ablation::ablation(args),
         What::Sweep(args) => sweep::sweep(args, verbosity),
         What::Compare(args) => sweep::compare(args),

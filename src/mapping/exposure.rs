@@ -51,6 +51,8 @@ impl ExposureConfig {
 
 /// Pixels that the map covers less than this say nothing.
 const MIN_ALPHA: f32 = 0.95;
+/// Pixels of an image that are compared: their median varies by a few thousandths of their spread.
+const MAX_SAMPLES: usize = 1 << 17;
 /// Nor do those that are nearly black or nearly saturated in the image or the render.
 const WELL_EXPOSED: std::ops::Range<f32> = 0.08..0.92;
 
@@ -62,22 +64,24 @@ pub(super) fn measure(
     last: &Exposure,
     config: &ExposureConfig,
 ) -> Exposure {
-    let covered = (0..rendered.color_depth.len()).filter(|&i| rendered.alpha(i) >= MIN_ALPHA);
+    let stride = rendered.color_depth.len().div_ceil(MAX_SAMPLES).max(1);
+    let pixels = || (0..rendered.color_depth.len()).step_by(stride);
+    let covered = pixels().filter(|&i| rendered.alpha(i) >= MIN_ALPHA);
     let covered: Vec<(usize, [u8; 3])> = covered.filter_map(|i| Some((i, recorded(i)?))).collect();
     let channel = |k: usize| {
-        let log_ratio = |&(i, pixel): &(usize, [u8; 3])| {
+        let ratio = |&(i, pixel): &(usize, [u8; 3])| {
             let recorded = f32::from(pixel[k]) / 255.0;
             let shown = rendered.color_depth[i][k];
-            (WELL_EXPOSED.contains(&recorded) && WELL_EXPOSED.contains(&shown)).then(|| (recorded / shown).ln())
+            (WELL_EXPOSED.contains(&recorded) && WELL_EXPOSED.contains(&shown)).then(|| recorded / shown)
         };
-        let mut ratios: Vec<f32> = covered.iter().filter_map(log_ratio).collect();
+        let mut ratios: Vec<f32> = covered.iter().filter_map(ratio).collect();
         let count = ratios.len();
         if count == 0 {
             return last.0[k];
         }
         let (_, median, _) = ratios.select_nth_unstable_by(count / 2, f32::total_cmp);
-        let trust = count as f32 / (count as f32 + config.prior_share * rendered.color_depth.len() as f32);
-        let change = *median - last.0[k];
+        let trust = count as f32 / (count as f32 + config.prior_share * pixels().len() as f32);
+        let change = median.ln() - last.0[k];
         let found = if change.abs() <= config.max_change { last.0[k] + trust * change } else { last.0[k] };
         (1.0 - config.pull) * found
     };

@@ -31,11 +31,11 @@ pub(super) fn gaussians(
     let mut cloud = GaussianCloud::new(sh_degree);
     let image = &keyframe.image;
     let Some(depth) = &image.depth else { return cloud };
-    let filled = fill_holes(depth);
     let (width, height) = image.color.dimensions();
-    let sums = ColorSums::new(&image.color);
-    let missed = rendered.map(|r| Missed::new(&image.color, r));
-    for block in sums.blocks(config) {
+    let blocks = || ColorSums::new(&image.color).blocks(config);
+    let missed = || rendered.map(|r| Missed::new(&image.color, r));
+    let (filled, (blocks, missed)) = rayon::join(|| fill_holes(depth), || rayon::join(blocks, missed));
+    for block in blocks {
         let center = ((block.x + block.size / 2).min(width - 1), (block.y + block.size / 2).min(height - 1));
         let pixel = (center.1 * width + center.0) as usize;
         let metres = filled[pixel];
@@ -125,44 +125,48 @@ struct Block {
 }
 
 /// Sums of `N` values over the pixels above and left of each corner, `[H + 1, W + 1]`, so that those over any rectangle cost four reads.
-struct Sums<const N: usize> {
+struct Sums<T, const N: usize> {
     width: u32,
     height: u32,
-    sums: Vec<[f64; N]>,
+    sums: Vec<[T; N]>,
 }
 
-impl<const N: usize> Sums<N> {
+impl<T: Copy + Default, const N: usize> Sums<T, N> {
     /// Sums of values in row-major order.
-    fn new((width, height): (u32, u32), values: impl Iterator<Item = [f64; N]>) -> Self {
+    fn new((width, height): (u32, u32), mut values: impl Iterator<Item = [T; N]>, add: impl Fn(T, T) -> T) -> Self {
         let row = width as usize + 1;
-        let mut sums = vec![[0.0; N]; row * (height as usize + 1)];
-        for (i, own) in values.enumerate() {
-            let at = (i / width as usize + 1) * row + i % width as usize + 1;
-            sums[at] = std::array::from_fn(|k| own[k] + sums[at - 1][k] + sums[at - row][k] - sums[at - row - 1][k]);
+        let mut sums = vec![[T::default(); N]; row * (height as usize + 1)];
+        for y in 1..=height as usize {
+            let (above, below) = sums.split_at_mut(y * row);
+            let above = &above[(y - 1) * row + 1..];
+            let mut along = [T::default(); N];
+            for ((to, above), own) in below[1..row].iter_mut().zip(above).zip(&mut values) {
+                along = std::array::from_fn(|k| add(along[k], own[k]));
+                *to = std::array::from_fn(|k| add(above[k], along[k]));
+            }
         }
         Self { width, height, sums }
     }
 
-    /// Means over the part of a rectangle that is on the image, from its first corner to before its last.
-    fn means(&self, (x0, y0): (u32, u32), (x1, y1): (u32, u32)) -> [f64; N] {
+    /// The sums at the corners of a rectangle, from its first corner to before its last, as far as it is on the image: top left, top right,
+    /// bottom left, bottom right; and its pixels.
+    fn corners(&self, (x0, y0): (u32, u32), (x1, y1): (u32, u32)) -> ([[T; N]; 4], f64) {
         let (x1, y1) = (x1.min(self.width), y1.min(self.height));
         let at = |x: u32, y: u32| self.sums[y as usize * (self.width as usize + 1) + x as usize];
-        let (a, b, c, d) = (at(x0, y0), at(x1, y0), at(x0, y1), at(x1, y1));
-        let pixels = f64::from((x1 - x0) * (y1 - y0));
-        std::array::from_fn(|k| (d[k] + a[k] - b[k] - c[k]) / pixels)
+        ([at(x0, y0), at(x1, y0), at(x0, y1), at(x1, y1)], f64::from((x1 - x0) * (y1 - y0)))
     }
 }
 
-/// The channels of an image, and the squares of all three together (8-bit values).
-struct ColorSums(Sums<4>);
+/// The channels of an image, and the squares of all three together (8-bit values). They wrap, but not their differences over a block.
+struct ColorSums(Sums<u32, 4>);
 
 impl ColorSums {
     fn new(image: &RgbImage) -> Self {
-        let values = image.pixels().map(|pixel| {
-            let [r, g, b] = pixel.0.map(f64::from);
+        let values = image.as_raw().chunks_exact(3).map(|pixel| {
+            let [r, g, b] = [pixel[0], pixel[1], pixel[2]].map(u32::from);
             [r, g, b, r * r + g * g + b * b]
         });
-        Self(Sums::new(image.dimensions(), values))
+        Self(Sums::new(image.dimensions(), values, u32::wrapping_add))
     }
 
     /// Blocks that cover the image: quartered while their colours deviate more than noise does, but not below the stride.
@@ -187,54 +191,65 @@ impl ColorSums {
 
     /// Standard deviation of the colours about their mean over the part of a block that is on the image, 0 to 1, mean over the channels.
     fn deviation(&self, Block { x, y, size }: Block) -> f32 {
-        let [r, g, b, squares] = self.0.means((x, y), (x + size, y + size));
+        let ([above, beside, below, last], pixels) = self.0.corners((x, y), (x + size, y + size));
+        let sum = |k: usize| last[k].wrapping_add(above[k]).wrapping_sub(beside[k]).wrapping_sub(below[k]);
+        let [r, g, b, squares] = std::array::from_fn(|k| f64::from(sum(k)) / pixels);
         let variance = (squares - (r * r + g * g + b * b)) / 3.0;
         variance.max(0.0).sqrt() as f32 / 255.0
     }
 }
 
 /// Brightness residual, image minus render.
-struct Missed(Sums<1>);
+struct Missed(Sums<f64, 1>);
 
 impl Missed {
     fn new(image: &RgbImage, rendered: &Rendered) -> Self {
-        let missed = |(pixel, render): (&image::Rgb<u8>, &[f32; 4])| {
+        let missed = |(pixel, render): (&[u8], &[f32; 4])| {
             [(0..3).map(|k| f64::from(pixel[k]) / 255.0 - f64::from(render[k])).sum::<f64>() / 3.0]
         };
-        Self(Sums::new(image.dimensions(), image.pixels().zip(&rendered.color_depth).map(missed)))
+        let values = image.as_raw().chunks_exact(3).zip(&rendered.color_depth).map(missed);
+        Self(Sums::new(image.dimensions(), values, |a, b| a + b))
     }
 
     /// How a block differs from its surroundings in what is missed: the Laplacian of Gaussian at the block's scale, by boxes.
     fn response(&self, Block { x, y, size }: Block) -> f32 {
-        let around = self.0.means((x.saturating_sub(size), y.saturating_sub(size)), (x + 2 * size, y + 2 * size));
-        (self.0.means((x, y), (x + size, y + size))[0] - around[0]).abs() as f32
+        let mean = |first, end| {
+            let ([[above], [beside], [below], [last]], pixels) = self.0.corners(first, end);
+            (last + above - beside - below) / pixels
+        };
+        let around = mean((x.saturating_sub(size), y.saturating_sub(size)), (x + 2 * size, y + 2 * size));
+        (mean((x, y), (x + size, y + size)) - around).abs() as f32
     }
 }
 
 /// Depth with its holes interpolated from their four sides, metres; 0 only where a pixel has no measured side at all.
 fn fill_holes(depth: &DepthImage) -> Vec<f32> {
-    let (width, height) = (depth.width as usize, depth.height as usize);
-    // Nearest measured pixel to the left, right, top and bottom: (depth, distance).
-    let mut sides = vec![[(0.0f32, 0.0f32); 4]; width * height];
-    let mut sweep = |side: usize, order: &mut dyn Iterator<Item = usize>| {
-        let mut last = (0.0f32, 0.0f32);
-        for i in order {
-            last.1 += 1.0;
-            if depth.metres[i] > 0.0 {
-                last = (depth.metres[i], 0.0);
-            }
-            sides[i][side] = last;
+    let width = depth.width as usize;
+    let mut filled = depth.metres.clone();
+    let holes: Vec<usize> = (0..filled.len()).filter(|&i| depth.metres[i] <= 0.0).collect();
+    // Nearest measured pixel of each hole to the left, right, top and bottom: (depth, distance).
+    let mut sides = vec![[(0.0f32, 0.0f32); 4]; holes.len()];
+    let mut sweep = |side: usize,
+                     order: &mut dyn Iterator<Item = usize>,
+                     line: &dyn Fn(usize) -> usize,
+                     towards: &dyn Fn(usize) -> Option<usize>| {
+        // Of the last hole in each row or column.
+        let mut last = vec![(0.0f32, 0.0f32); width.max(depth.height as usize)];
+        for hole in order {
+            let i = holes[hole];
+            let Some(neighbour) = towards(i) else { continue };
+            let (metres, distance) = if depth.metres[neighbour] > 0.0 { (depth.metres[neighbour], 0.0) } else { last[line(i)] };
+            sides[hole][side] = (metres, distance + 1.0);
+            last[line(i)] = sides[hole][side];
         }
     };
-    for y in 0..height {
-        sweep(0, &mut (0..width).map(|x| y * width + x));
-        sweep(1, &mut (0..width).rev().map(|x| y * width + x));
-    }
-    for x in 0..width {
-        sweep(2, &mut (0..height).map(|y| y * width + x));
-        sweep(3, &mut (0..height).rev().map(|y| y * width + x));
-    }
-    depth.metres.iter().zip(&sides).map(|(&own, around)| if own > 0.0 { own } else { interpolate(around) }).collect()
+    let (row, column) = (|i: usize| i / width, |i: usize| i % width);
+    sweep(0, &mut (0..holes.len()), &row, &|i| (column(i) > 0).then(|| i - 1));
+    sweep(1, &mut (0..holes.len()).rev(), &row, &|i| (column(i) + 1 < width).then_some(i + 1));
+    sweep(2, &mut (0..holes.len()), &column, &|i| i.checked_sub(width));
+    sweep(3, &mut (0..holes.len()).rev(), &column, &|i| (i + width < depth.metres.len()).then_some(i + width));
+    holes.iter().zip(&sides).for_each(|(&i, around)| filled[i] = interpolate(around));
+    filled
 }
 
 fn interpolate(around: &[(f32, f32); 4]) -> f32 {

@@ -11,6 +11,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use cpu_time::ThreadTime;
 use fastrand::Rng;
 use serde::{Deserialize, Serialize};
 
@@ -18,6 +19,7 @@ pub use refine::{FinalRefinement, RefineReport};
 pub use state::MapperState;
 
 use super::gaussian_stats::GaussianStats;
+use super::host_time::HostTimes;
 use super::image_store::ImageStore;
 use super::keyframe::{DepthSource, MappedKeyframe};
 use super::plane_sweep::{self, SourceView};
@@ -73,6 +75,7 @@ pub struct Mapper {
     images: ImageStore,
     rng: Rng,
     step_times: Vec<Duration>,
+    host_times: HostTimes,
     /// Keyframes left of the running epoch of consolidation.
     epoch: Vec<usize>,
     /// Whether the adapter has no room for more Gaussians, which is reported once.
@@ -94,6 +97,7 @@ impl Mapper {
             images: ImageStore::new(config.limits.max_host_bytes),
             rng: Rng::with_seed(config.seed),
             step_times: Vec::new(),
+            host_times: HostTimes::default(),
             epoch: Vec::new(),
             is_full: false,
             gpu,
@@ -109,18 +113,19 @@ impl Mapper {
         if keyframe.image.depth.is_none() && self.has_not_begun() {
             return Ok(KeyframeReport { id: keyframe.id, ..KeyframeReport::default() });
         }
-        let mut keyframe = self.sweep(keyframe).map_or(Cow::Borrowed(keyframe), Cow::Owned);
+        let mut keyframe = self.timed("depth", |mapper| mapper.sweep(keyframe)).map_or(Cow::Borrowed(keyframe), Cow::Owned);
         let is_compared = keyframe.image.depth.is_some() || (self.config.exposure.enabled && self.is_trained());
-        let rendered = if is_compared && !self.cloud.is_empty() { Some(self.render(&keyframe.camera())?) } else { None };
-        let exposure = self.exposure(&keyframe.image, rendered.as_ref());
+        let is_compared = is_compared && !self.cloud.is_empty();
+        let rendered = is_compared.then(|| self.timed("render", |mapper| mapper.render(&keyframe.camera()))).transpose()?;
+        let exposure = self.timed("exposure", |mapper| mapper.exposure(&keyframe.image, rendered.as_ref()));
         // Before its insertion: a bound on memory leaves to it what the image has left.
-        let mapped = self.upload(&keyframe, exposure)?;
+        let mapped = self.timed("image", |mapper| mapper.upload(&keyframe, exposure))?;
         self.keyframes.push(mapped);
         if exposure != Exposure::default() {
             keyframe.to_mut().image.color = exposure::corrected(&keyframe.image.color, &exposure);
         }
         self.limit_gpu_images()?;
-        let inserted = self.insert_gaussians(&keyframe, rendered.as_ref())?;
+        let inserted = self.timed("insertion", |mapper| mapper.insert_gaussians(&keyframe, rendered.as_ref()))?;
         let first = self.keyframes.len() == 1;
         let iterations = if first { self.config.first_iterations } else { self.config.iterations_per_keyframe };
         if iterations == 0 {
@@ -188,6 +193,18 @@ impl Mapper {
     /// Duration of each step so far: its share of its batch.
     pub fn step_times(&self) -> &[Duration] {
         &self.step_times
+    }
+
+    /// CPU time of the calling threads so far, by part of the work.
+    pub fn host_times(&self) -> &HostTimes {
+        &self.host_times
+    }
+
+    fn timed<T>(&mut self, part: &'static str, work: impl FnOnce(&mut Self) -> T) -> T {
+        let started = ThreadTime::now();
+        let done = work(self);
+        self.host_times.add(part, started);
+        done
     }
 
     /// Whether any step has moved the map: before, its colours are those of single pixels.
@@ -258,7 +275,9 @@ impl Mapper {
         }
         taken += self.take(&scoring, &config.adam, &|| false)?;
         self.stats.keyframe_mapped();
-        let (pruned, grown) = if controlled { self.control_density(taken.scored.take(), density)? } else { (0, 0) };
+        let scored = taken.scored.take();
+        let control = |mapper: &mut Self| mapper.control_density(scored, density);
+        let (pruned, grown) = if controlled { self.timed("density", control)? } else { (0, 0) };
         let rest = self.with_consolidation(after);
         taken += self.take(&rest, &config.adam, stop)?;
         if config.yields_to_keyframes {
@@ -275,7 +294,7 @@ impl Mapper {
             if stop() {
                 break;
             }
-            taken += self.steps(batch, adam)?;
+            taken += self.timed("steps", |mapper| mapper.steps(batch, adam))?;
         }
         Ok(taken)
     }

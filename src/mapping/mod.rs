@@ -6,6 +6,7 @@ mod density;
 mod error;
 mod exposure;
 mod gaussian_stats;
+mod host_time;
 mod image_store;
 mod initialise_from_points;
 mod insertion;
@@ -21,6 +22,7 @@ pub use config::{InsertionConfig, MappingConfig, PointsConfig, RefineConfig, Win
 pub use density::{ClassicConfig, DensityConfig, DensityStrategy, MultiViewConfig};
 pub use error::MappingError;
 pub use exposure::ExposureConfig;
+pub use host_time::HostTimes;
 pub use keyframe::{DepthSource, Keyframe, RightImage};
 pub use limits::LimitsConfig;
 pub use mapper::{FinalRefinement, KeyframeReport, Mapper, MapperState, RefineReport};
