@@ -1,4 +1,5 @@
-# `make demo`: a map in a few minutes, without any recording. `make test`, `make check`: what the project asks of itself. `make gpu-static`: what compilers for GPUs make of the shaders.
+# `make demo`: a map in a few minutes, without any recording. `make test`, `make check`: what the project asks of itself.
+# `make gpu-static`: what compilers for GPUs make of the shaders.
 
 CARGO_HOME ?= $(HOME)/.cargo
 # Where rustup puts cargo, in case it was installed just now.

@@ -37,7 +37,7 @@ def stages(gaussians, visible, pairs, evaluations, pixels, coefficients):
         "tile sort, ranges": (pairs * 2 * 20 + pairs * 4, pairs / 32 * 2 * 60, 0),
         "rasterize_forward": (pairs * 56 + pixels * 24 + pairs * 20, evaluations / 4 / 32 * 88, 500 * 130),
         "loss": (pixels * (20 * halo + 12 * 3 * halo + 56 + 32), pixels / 32 * 450, 0),
-        # 32 strips a Gaussian; a stretch has 31 steps of run-in.
+        # 32 strips a Gaussian; a bucket has 31 steps of run-in.
         "rasterize_backward": (pairs * (56 + 48 + 20) + pixels * 56, pairs / 0.8 * 217, (BUCKET + 31) * 250),
         "slot sums, Adam": (pairs * 96 + visible * planes * 16 * 6, pairs / 0.83 / 32 * 30 + visible / 32 * (600 + 90 * planes), 64 * 450),
     }

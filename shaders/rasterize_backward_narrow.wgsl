@@ -30,18 +30,15 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
             let chunk_end = min(blended, chunk + CHUNK);
             for (var k = chunk; k < chunk_end; k++) {
                 let at = place.member * BATCH + k - start;
-                let mean = batch_mean[at];
-                let shape = batch_conic_factor[at];
-                let color = batch_color[at];
-                let dx = block.x - mean.x;
+                let gaussian = Listed(batch_mean[at], batch_conic_factor[at], batch_color[at], k);
                 var sum = IntersectionGradient(vec4(0.0), vec4(0.0), vec4(0.0));
                 for (var s = 0u; s < STRIPS; s++) {
                     var strip = pixels[s];
-                    add_gradient(dx, block.y + f32(s) - mean.y, mean, shape, color, k, &strip, &sum);
+                    add_gradient(gaussian, block.x, block.y + f32(s), &strip, &sum);
                     pixels[s] = strip;
                 }
                 let to = partials + (k - chunk) * 3u * TILE_THREADS + place.thread;
-                partial[to] = before_clamp(color, sum.color_depth);
+                partial[to] = before_clamp(gaussian.color, sum.color_depth);
                 partial[to + TILE_THREADS] = sum.first;
                 partial[to + 2u * TILE_THREADS] = sum.second;
             }

@@ -8,18 +8,9 @@ fn begin_sum() {
     sum = IntersectionGradient(vec4(0.0), vec4(0.0), vec4(0.0));
 }
 
-fn add_strip(
-    dx: vec4<f32>,
-    dy: f32,
-    mean: vec4<f32>,
-    shape: vec4<f32>,
-    color: vec4<f32>,
-    position: u32,
-    strip: u32,
-    pixels: ptr<function, PixelState>,
-) {
+fn add_strip(gaussian: Listed, x: vec4<f32>, y: f32, strip: u32, pixels: ptr<function, PixelState>) {
     var grown = sum;
-    add_gradient(dx, dy, mean, shape, color, position, pixels, &grown);
+    add_gradient(gaussian, x, y, pixels, &grown);
     sum = grown;
 }
 

@@ -1,8 +1,8 @@
 // Blends the tiles' Gaussians front to back into colour, depth and transmittance (Kerbl et al. 2023, eq. 3).
 
 // [H, W] (r, g, b, Σ w z): colour over the background, depth weighted by what was blended. Behind it, in the wide form, checkpoints for the backward pass,
-// [buckets, 5, TILE_THREADS]: where a stretch of BUCKET Gaussians begins within a tile's list, what each strip has blended before it: red, green, blue, depth,
-// transmittance. The bucket is that of BUCKET places of the sorted list.
+// [buckets, 5, TILE_THREADS]: where a bucket of BUCKET Gaussians begins within a tile's list, what each strip has blended before it: red, green, blue, depth,
+// transmittance. Its number is its first place in the sorted list over BUCKET.
 @group(0) @binding(5) var<storage, read_write> color_depth: array<vec4<f32>>;
 // [H, W] (bits of the transmittance, intersections of the tile's list up to and with the last one blended).
 @group(0) @binding(6) var<storage, read_write> state: array<vec2<u32>>;

@@ -29,14 +29,11 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
             let chunk_end = min(blended, chunk + CHUNK);
             for (var k = chunk; k < chunk_end; k++) {
                 let at = place.member * BATCH + k - start;
-                let mean = batch_mean[at];
-                let shape = batch_conic_factor[at];
-                let color = batch_color[at];
-                let dx = block.x - mean.x;
+                let gaussian = Listed(batch_mean[at], batch_conic_factor[at], batch_color[at], k);
                 var sum = PairScore(vec4(0.0), vec4(0.0));
                 for (var s = 0u; s < STRIPS; s++) {
                     var strip = pixels[s];
-                    add_score(dx, block.y + f32(s) - mean.y, mean, shape, color, k, is_error[s], &strip, &sum);
+                    add_score(gaussian, block.x, block.y + f32(s), is_error[s], &strip, &sum);
                     pixels[s] = strip;
                 }
                 let to = partials + (k - chunk) * 2u * TILE_THREADS + place.thread;

@@ -14,19 +14,10 @@ fn begin_sum() {
     sum = PairScore(vec4(0.0), vec4(0.0));
 }
 
-fn add_strip(
-    dx: vec4<f32>,
-    dy: f32,
-    mean: vec4<f32>,
-    shape: vec4<f32>,
-    color: vec4<f32>,
-    position: u32,
-    strip: u32,
-    pixels: ptr<function, PixelState>,
-) {
+fn add_strip(gaussian: Listed, x: vec4<f32>, y: f32, strip: u32, pixels: ptr<function, PixelState>) {
     let is_error = select(vec4(0.0), vec4(1.0), (vec4(strip_errors[strip]) & vec4(1u, 2u, 4u, 8u)) != vec4(0u));
     var grown = sum;
-    add_score(dx, dy, mean, shape, color, position, is_error, pixels, &grown);
+    add_score(gaussian, x, y, is_error, pixels, &grown);
     sum = grown;
 }
 

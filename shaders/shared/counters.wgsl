@@ -8,7 +8,7 @@ struct Counter {
     per_element: array<u32, 3>,
     // Indirect dispatch with one workgroup per SORT_BLOCK elements.
     per_block: array<u32, 3>,
-    // Indirect dispatch with one workgroup per stretch of BUCKET Gaussians of a tile's list, or somewhat more.
+    // Indirect dispatch with one workgroup per bucket of a tile's list, or somewhat more.
     per_bucket: array<u32, 3>,
 }
 

@@ -64,7 +64,15 @@ fn load_pixels(place: Place, strip: u32) -> PixelState {
     return pixels;
 }
 
-// What one Gaussian does to a strip, from its whitened distance (u, v).
+// A Gaussian of a tile's list: see `project_forward`, and its place in the list.
+struct Listed {
+    mean: vec4<f32>,
+    shape: vec4<f32>,
+    color: vec4<f32>,
+    position: u32,
+}
+
+// What one Gaussian does to a strip.
 struct Passed {
     weight: vec4<f32>,
     // ∂L/∂log α.
@@ -72,21 +80,14 @@ struct Passed {
     hit: vec4<bool>,
 }
 
-// Takes a strip past one Gaussian, the one at `position` in the tile's list.
-fn pass_gaussian(
-    u: vec4<f32>,
-    v: f32,
-    mean: vec4<f32>,
-    opacity: f32,
-    color: vec4<f32>,
-    position: u32,
-    pixels: ptr<function, PixelState>,
-) -> Passed {
+// Takes a strip past one Gaussian; (u, v) is its whitened distance.
+fn pass_gaussian(gaussian: Listed, u: vec4<f32>, v: f32, pixels: ptr<function, PixelState>) -> Passed {
+    let color = gaussian.color;
     let distance = u * u + v * v;
-    let hit = (distance <= vec4(mean.w)) & (vec4(position) < (*pixels).last);
-    let unbounded = opacity * exp(-distance);
+    let hit = (distance <= vec4(gaussian.mean.w)) & (vec4(gaussian.position) < (*pixels).last);
+    let unbounded = gaussian.shape.w * exp(-distance);
     let alpha = select(vec4(0.0), min(vec4(ALPHA_MAX), unbounded), hit);
-    let value = (*pixels).red * color.x + (*pixels).green * color.y + (*pixels).blue * color.z + (*pixels).depth * mean.z;
+    let value = (*pixels).red * color.x + (*pixels).green * color.y + (*pixels).blue * color.z + (*pixels).depth * gaussian.mean.z;
     let weight = alpha * (*pixels).transmittance;
     (*pixels).behind -= weight * value;
     let gradient_alpha = (*pixels).transmittance * value - (*pixels).behind / (1.0 - alpha);
@@ -95,18 +96,12 @@ fn pass_gaussian(
     return Passed(weight, select(vec4(0.0), gradient_alpha * alpha, hit & (unbounded <= vec4(ALPHA_MAX))), hit);
 }
 
-// The same, and adds to its gradient; `dx`, `dy` lead from its mean to the strip's pixels.
-fn add_gradient(
-    dx: vec4<f32>,
-    dy: f32,
-    mean: vec4<f32>,
-    shape: vec4<f32>,
-    color: vec4<f32>,
-    position: u32,
-    pixels: ptr<function, PixelState>,
-    sum: ptr<function, IntersectionGradient>,
-) {
-    let passed = pass_gaussian(shape.x * dx + shape.y * dy, shape.z * dy, mean, shape.w, color, position, pixels);
+// Takes the strip at columns `x` of row `y` past one Gaussian, and adds to its gradient.
+fn add_gradient(gaussian: Listed, x: vec4<f32>, y: f32, pixels: ptr<function, PixelState>, sum: ptr<function, IntersectionGradient>) {
+    let dx = x - gaussian.mean.x;
+    let dy = y - gaussian.mean.y;
+    let shape = gaussian.shape;
+    let passed = pass_gaussian(gaussian, shape.x * dx + shape.y * dy, shape.z * dy, pixels);
     let weight = passed.weight;
     let q = dot(passed.q, vec4(1.0));
     let qx = dot(passed.q, dx);

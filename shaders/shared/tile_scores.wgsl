@@ -42,20 +42,12 @@ fn error_pixels(place: Place, strip: u32, threshold: f32) -> vec4<f32> {
 }
 
 // Takes a strip past one Gaussian as `add_gradient` does, and adds to its score.
-fn add_score(
-    dx: vec4<f32>,
-    dy: f32,
-    mean: vec4<f32>,
-    shape: vec4<f32>,
-    color: vec4<f32>,
-    position: u32,
-    is_error: vec4<f32>,
-    pixels: ptr<function, PixelState>,
-    sum: ptr<function, PairScore>,
-) {
-    let u = shape.x * dx + shape.y * dy;
+fn add_score(gaussian: Listed, x: vec4<f32>, y: f32, is_error: vec4<f32>, pixels: ptr<function, PixelState>, sum: ptr<function, PairScore>) {
+    let shape = gaussian.shape;
+    let dy = y - gaussian.mean.y;
+    let u = shape.x * (x - gaussian.mean.x) + shape.y * dy;
     let v = shape.z * dy;
-    let passed = pass_gaussian(u, v, mean, shape.w, color, position, pixels);
+    let passed = pass_gaussian(gaussian, u, v, pixels);
     let weight = passed.weight;
     let by_x = 2.0 * passed.q * shape.x * u;
     let by_y = 2.0 * passed.q * (shape.y * u + shape.z * v);

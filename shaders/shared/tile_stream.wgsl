@@ -1,7 +1,7 @@
 // Passes a tile's pixels by its Gaussians, in the form that suits wide SIMD units (after Mallick et al. 2024, Taming 3DGS): each invocation keeps a
 // Gaussian in registers, and the tile's strips of pixels pass by. At each step invocation i works on the strip that invocation i - 1 has just left, so that
 // every strip meets the Gaussians in their order; an invocation that has seen all strips takes the Gaussian TILE_THREADS places further on. A workgroup
-// takes one stretch of BUCKET Gaussians of a tile's list, from the pixels' state that the forward pass left at its start: no list is longer than that.
+// takes one bucket, BUCKET Gaussians of a tile's list, from the pixels' state that the forward pass left at its start: no list is longer than that.
 // STRIPS and GROUP_TILES are 1: there are as many strips as invocations, all of one tile.
 //
 // Who includes it says what is summed: `load_strip`, `begin_sum`, `add_strip`, `store_sum`, `clear_sum`.
@@ -9,7 +9,7 @@
 // The strips' state, in workgroup memory.
 var<workgroup> strips: array<PixelState, TILE_THREADS>;
 
-// A stretch of a tile's list.
+// A part of a tile's list.
 struct Bucket {
     tile: u32,
     // From the tile's first intersection on.
@@ -18,8 +18,8 @@ struct Bucket {
     is_there: bool,
 }
 
-// The first stretches of all tiles, then the later ones. Where these begin within BUCKET places of the sorted list is at most one, of the tile that holds the
-// first of these places: the first stretch of a tile is no later one, and the next is BUCKET places further.
+// The first buckets of all tiles, then the later ones. Of these at most one begins within BUCKET places of the sorted list, in the tile that holds the
+// first of these places: a tile's second bucket begins BUCKET places after its list.
 fn bucket_of(group: u32) -> Bucket {
     let tiles = view.tiles_x * view.tiles_y;
     if group < tiles {
@@ -57,23 +57,17 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
     strips[local] = pixels;
     load_strip(place, local);
     let blended = workgroupUniformLoad(&longest);
-    // Of the stretch: its Gaussians, those that were blended, and the steps it takes.
+    // Of the bucket: its Gaussians, those that were blended, and the steps it takes.
     let length = min(range.y - first, BUCKET);
     let count = min(max(blended, bucket.start) - bucket.start, length);
     let end = select(0u, count + TILE_THREADS - 1u, count > 0u);
 
-    var mean = vec4(0.0);
-    var shape = vec4(0.0);
-    var color = vec4(0.0);
-    var next_mean = vec4(0.0);
-    var next_shape = vec4(0.0);
-    var next_color = vec4(0.0);
+    var gaussian: Listed;
+    var next: Listed;
     for (var step = 0u; step < end; step++) {
         if step % TILE_THREADS == 0u && step + local < count {
-            let gaussian = slot_gaussians[sorted_slots[first + step + local]];
-            next_mean = projected[3u * gaussian];
-            next_shape = projected[3u * gaussian + 1u];
-            next_color = projected[3u * gaussian + 2u];
+            let i = slot_gaussians[sorted_slots[first + step + local]];
+            next = Listed(projected[3u * i], projected[3u * i + 1u], projected[3u * i + 2u], bucket.start + step + local);
         }
         // Steps since invocation `local` began; it wraps before that, and is then beyond any list.
         let age = step - local;
@@ -81,18 +75,16 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
         let position = age - turn + local;
         if step >= local && position < count {
             if turn == 0u {
-                mean = next_mean;
-                shape = next_shape;
-                color = next_color;
+                gaussian = next;
                 begin_sum();
             }
             let block = block_of(place.tile, turn);
             var passing = strips[turn];
-            add_strip(block.x - mean.x, block.y - mean.y, mean, shape, color, bucket.start + position, turn, &passing);
+            add_strip(gaussian, block.x, block.y, turn, &passing);
             strips[turn].transmittance = passing.transmittance;
             strips[turn].behind = passing.behind;
             if turn == TILE_THREADS - 1u {
-                store_sum(sorted_slots[first + position], color);
+                store_sum(sorted_slots[first + position], gaussian.color);
             }
         }
         workgroupBarrier();
@@ -103,7 +95,7 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
     }
 }
 
-// From the checkpoint (see `rasterize_forward`), takes a strip to where the forward pass was at the start of the stretch.
+// From the checkpoint (see `rasterize_forward`), takes a strip to where the forward pass was at the start of the bucket.
 fn resume(pixels: ptr<function, PixelState>, bucket: u32, local: u32) {
     let at = view.width * view.height + bucket * 5u * TILE_THREADS + local;
     let red = color_depth[at] * (*pixels).red;

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
+use cpu_time::ThreadTime;
 use fastrand::Rng;
 use image::{Rgb, RgbImage};
 use nalgebra::Vector2;
@@ -36,7 +37,7 @@ pub struct HostReport {
     pub gaussians: usize,
     /// CPU time of the mapping thread for each keyframe by part, milliseconds.
     pub parts_ms: BTreeMap<&'static str, f64>,
-    /// Sum of the parts.
+    /// All of the thread's CPU time for a keyframe, the parts and what is between them, milliseconds.
     pub total_ms: f64,
     /// Blocking waits, at most.
     pub waits: u64,
@@ -61,20 +62,22 @@ pub fn bench_host(gpu: &Arc<Gpu>, bench: HostBench) -> Result<HostReport, Mappin
     let parts = |times: &HostTimes| times.parts().collect::<BTreeMap<_, _>>();
     let before = parts(mapper.host_times());
     let (mut waits, mut bytes_read, mut uploads) = (0, 0, 0);
+    let mut total = Duration::ZERO;
     for id in (2..).take(bench.keyframes) {
         let earlier = gpu.traffic();
-        mapper.insert(&keyframe(id, &bench), &|| false)?;
+        let keyframe = keyframe(id, &bench);
+        let started = ThreadTime::now();
+        mapper.insert(&keyframe, &|| false)?;
+        total += started.elapsed();
         let traffic = gpu.traffic() - earlier;
         waits = waits.max(traffic.waits);
         bytes_read = bytes_read.max(traffic.bytes_read);
         uploads = uploads.max(traffic.uploads);
     }
-    let each = |(part, time): (&'static str, Duration)| {
-        let own = time - before.get(part).copied().unwrap_or_default();
-        (part, own.as_secs_f64() * 1e3 / bench.keyframes.max(1) as f64)
-    };
-    let parts_ms: BTreeMap<_, _> = mapper.host_times().parts().map(each).collect();
-    let total_ms = parts_ms.values().sum();
+    let ms = |time: Duration| time.as_secs_f64() * 1e3 / bench.keyframes.max(1) as f64;
+    let own = |part, time: Duration| ms(time - before.get(part).copied().unwrap_or_default());
+    let parts_ms = mapper.host_times().parts().map(|(part, time)| (part, own(part, time))).collect();
+    let total_ms = ms(total);
     Ok(HostReport { bench, gaussians: mapper.gaussians(), parts_ms, total_ms, waits, bytes_read, uploads })
 }
 

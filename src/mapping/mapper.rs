@@ -122,7 +122,8 @@ impl Mapper {
         let mapped = self.timed("image", |mapper| mapper.upload(&keyframe, exposure))?;
         self.keyframes.push(mapped);
         if exposure != Exposure::default() {
-            keyframe.to_mut().image.color = exposure::corrected(&keyframe.image.color, &exposure);
+            let corrected = self.timed("image", |_| exposure::corrected(&keyframe.image.color, &exposure));
+            keyframe.to_mut().image.color = corrected;
         }
         self.limit_gpu_images()?;
         let inserted = self.timed("insertion", |mapper| mapper.insert_gaussians(&keyframe, rendered.as_ref()))?;

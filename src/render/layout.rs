@@ -46,7 +46,8 @@ impl BlendForm {
     /// Both forms.
     pub const ALL: [Self; 2] = [Self::Wide, Self::Narrow];
 
-    /// The faster form on this adapter. SwiftShader, though software, takes the wide one: its compiler needs 24 GB for the narrow one.
+    /// The faster form on this adapter. SwiftShader, though software, takes the wide one: the narrow one
+    /// takes its compiler 24 GB.
     pub fn of(gpu: &Gpu) -> Self {
         let is_swiftshader = gpu.adapter.name.to_lowercase().contains("swiftshader");
         if gpu.is_software() && !is_swiftshader { Self::Narrow } else { Self::Wide }
@@ -80,7 +81,8 @@ impl BlendForm {
     /// few others waiting, and a pass of its own costs more.
     pub(crate) fn slot_chunk(self) -> u32 {
         match self {
-            Self::Wide => 16,
+            // `sum_slots` has 64 invocations for each block of the sort, whose dispatch it shares.
+            Self::Wide => SORT_BLOCK / 64,
             Self::Narrow => 1,
         }
     }
@@ -192,7 +194,7 @@ impl Counter {
         counter as u64 * Self::SIZE + 20
     }
 
-    /// Byte offset of a counter's indirect arguments with one workgroup per stretch of a tile's list.
+    /// Byte offset of a counter's indirect arguments with one workgroup per bucket of a tile's list.
     pub const fn per_bucket_offset(counter: u32) -> u64 {
         counter as u64 * Self::SIZE + 32
     }
@@ -260,7 +262,7 @@ host_twins! {
         per_element: [u32; 3],
         /// Workgroups for one sorting block a workgroup.
         per_block: [u32; 3],
-        /// Workgroups for one stretch of a tile's list a workgroup.
+        /// Workgroups for one bucket of a tile's list a workgroup.
         per_bucket: [u32; 3],
     }
     /// Which of the two prefix sums (`shaders/scan_blocks.wgsl`).

@@ -189,16 +189,10 @@ impl Rasterizer {
         Sort::result_of(tile_bits(tiles))
     }
 
-    /// Encodes a pass over the sorted tile lists, front to back, from which the wide form takes stretches.
-    pub(crate) fn encode_over_lists(
-        &self,
-        pass: &mut wgpu::ComputePass<'_>,
-        prepared: &PreparedView,
-        kernel: &Kernel,
-        bindings: &[(u32, &GpuBuffer)],
-    ) {
-        let (gpu, ws) = (&*self.gpu, &self.workspace);
-        let lists = [
+    /// What all passes over the sorted tile lists bind.
+    fn lists(&self, prepared: &PreparedView) -> [(u32, &GpuBuffer); 7] {
+        let ws = &self.workspace;
+        [
             (0, self.view(prepared)),
             (1, &ws.ranges),
             (2, &ws.slots[prepared.sorted]),
@@ -206,16 +200,24 @@ impl Rasterizer {
             (4, &ws.projected),
             (5, &ws.color_depth),
             (6, &ws.state),
-        ];
-        let bindings = lists.iter().chain(bindings).copied();
+        ]
+    }
+
+    /// Encodes a pass over the sorted tile lists after the forward pass: the wide form takes them in buckets, the narrow one tile by tile.
+    pub(crate) fn encode_over_lists(
+        &self,
+        pass: &mut wgpu::ComputePass<'_>,
+        prepared: &PreparedView,
+        kernel: &Kernel,
+        bindings: &[(u32, &GpuBuffer)],
+    ) {
+        let bindings: Vec<_> = self.lists(prepared).into_iter().chain(bindings.iter().copied()).collect();
         match self.form {
             BlendForm::Wide => {
-                let size = IndirectSize { buffer: &ws.counters, offset: Counter::per_bucket_offset(INTERSECTION_COUNTER) };
-                kernel.dispatch_indirect(gpu, pass, &bindings.collect::<Vec<_>>(), size);
+                let offset = Counter::per_bucket_offset(INTERSECTION_COUNTER);
+                kernel.dispatch_indirect(&self.gpu, pass, &bindings, IndirectSize { buffer: &self.workspace.counters, offset });
             }
-            BlendForm::Narrow => {
-                kernel.dispatch(gpu, pass, &bindings.collect::<Vec<_>>(), self.form.workgroups(prepared.view.tiles()));
-            }
+            BlendForm::Narrow => kernel.dispatch(&self.gpu, pass, &bindings, self.form.workgroups(prepared.view.tiles())),
         }
     }
 
@@ -240,16 +242,7 @@ impl Rasterizer {
         let by_depth = SortJob { keys: &ws.depth_keys, values: &ws.order, counter: VISIBLE_COUNTER, bits: DEPTH_KEY_BITS };
         k.sort.encode(gpu, pass, ws, &by_depth);
         self.encode_tiles(pass, prepared);
-        let bindings = [
-            (0, uniform),
-            (1, &ws.ranges),
-            (2, &ws.slots[prepared.sorted]),
-            (3, &ws.slot_gaussians),
-            (4, &ws.projected),
-            (5, &ws.color_depth),
-            (6, &ws.state),
-        ];
-        k.rasterize_forward.dispatch(gpu, pass, &bindings, self.form.workgroups(view.tiles()));
+        k.rasterize_forward.dispatch(gpu, pass, &self.lists(prepared), self.form.workgroups(view.tiles()));
     }
 
     fn encode_scan(&self, pass: &mut wgpu::ComputePass<'_>, prepared: &PreparedView, setup: &GpuBuffer) {
