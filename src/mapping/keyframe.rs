@@ -7,7 +7,7 @@ use std::borrow::Cow;
 use image::GrayImage;
 use serde::{Deserialize, Serialize};
 
-use super::gaussian_stats;
+use super::anchors;
 use super::image_store::ImageStore;
 use super::plane_sweep::{self, SourceView};
 use super::{KeyframeId, MappingError, PoseUpdate};
@@ -181,7 +181,7 @@ impl MappedKeyframe {
         self.camera.camera_from_world = camera_from_world;
         self.scale_since_anchor *= update.scale;
         let scale = self.scale_since_anchor;
-        let motion = gaussian_stats::motion(&self.anchored_from_world.inverse(), &update.world_from_camera, scale);
+        let motion = anchors::motion(&self.anchored_from_world.inverse(), &update.world_from_camera, scale);
         if motion.is_some() {
             (self.anchored_from_world, self.scale_since_anchor) = (camera_from_world, 1.0);
             if scale != 1.0 && self.depth_is_estimated() {

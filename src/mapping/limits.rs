@@ -3,8 +3,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::gaussian_stats::GaussianHistory;
 use super::keyframe::MappedKeyframe;
+use crate::render::GaussianHistory;
 
 /// Bytes that the rasterizer's scratch and the scores take for each Gaussian.
 pub(super) const SCRATCH_BYTES_EACH: u64 = 124;
@@ -85,16 +85,18 @@ pub(super) fn insertions_allowed(inserted: usize, most: usize) -> usize {
     inserted.min((INSERTED_SHARE * most as f64) as usize)
 }
 
-/// The Gaussians to keep so that at most `most` are left: the least useful go, the older first among equals. Those that no view has scored
-/// yet, younger than `scored_age`, go last. Ascending.
-pub(super) fn largest_contributions(histories: &[GaussianHistory], most: usize, scored_age: u32) -> Vec<u32> {
+/// The `excess` Gaussians to remove: the least useful, the older first among equals. Those that no view has scored yet, and that came after
+/// `scored_round`, go last. Ascending.
+pub(super) fn least_contributions(histories: &[GaussianHistory], excess: usize, scored_round: f32) -> Vec<u32> {
     let contribution = |i: &u32| {
         let history = &histories[*i as usize];
-        if history.views == 0 && history.age < scored_age { f32::INFINITY } else { history.contribution }
+        if history.views == 0.0 && history.came > scored_round { f32::INFINITY } else { history.contribution }
     };
     let mut ranked: Vec<u32> = (0..histories.len() as u32).collect();
-    ranked.sort_by(|a, b| contribution(b).total_cmp(&contribution(a)).then(b.cmp(a)));
-    ranked.truncate(most);
+    if excess < ranked.len() {
+        ranked.select_nth_unstable_by(excess, |a, b| contribution(a).total_cmp(&contribution(b)).then(a.cmp(b)));
+        ranked.truncate(excess);
+    }
     ranked.sort_unstable();
     ranked
 }
@@ -118,14 +120,19 @@ mod tests {
 
     #[test]
     fn the_least_useful_go_first() {
-        let histories =
-            [0.3, 0.0, 2.0, 0.0, 0.1].map(|contribution| GaussianHistory { contribution, ..GaussianHistory::default() });
-        assert_eq!(largest_contributions(&histories, 4, 0), [0, 2, 3, 4]);
-        assert_eq!(largest_contributions(&histories, 2, 0), [0, 2]);
-        assert_eq!(largest_contributions(&histories, 9, 0), [0, 1, 2, 3, 4]);
+        let histories = [0.3, 0.0, 2.0, 0.0, 0.1].map(|contribution| GaussianHistory {
+            contribution,
+            came: 3.0,
+            ..GaussianHistory::default()
+        });
+        assert_eq!(least_contributions(&histories, 1, 3.0), [1]);
+        assert_eq!(least_contributions(&histories, 3, 3.0), [1, 3, 4]);
+        assert!(least_contributions(&histories, 0, 3.0).is_empty());
+        assert_eq!(least_contributions(&histories, 9, 3.0), [0, 1, 2, 3, 4]);
+        // Those that came later and were not scored go last.
         let mut some_scored = histories;
-        [0, 2, 4].into_iter().for_each(|i| some_scored[i].views = 1);
-        assert_eq!(largest_contributions(&some_scored, 3, 1), [1, 2, 3]);
+        [0, 2, 4].into_iter().for_each(|i| some_scored[i].views = 1.0);
+        assert_eq!(least_contributions(&some_scored, 2, 2.0), [0, 4]);
     }
 
     #[test]

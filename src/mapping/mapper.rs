@@ -18,16 +18,16 @@ use serde::{Deserialize, Serialize};
 pub use refine::{FinalRefinement, RefineReport};
 pub use state::MapperState;
 
-use super::gaussian_stats::GaussianStats;
+use super::anchors::Anchors;
 use super::host_time::HostTimes;
 use super::image_store::ImageStore;
 use super::keyframe::{DepthSource, MappedKeyframe};
 use super::plane_sweep::{self, SourceView};
 use super::schedule::{self, Step};
-use super::{Keyframe, KeyframeId, MappingConfig, MappingError, PoseUpdate, exposure, initialise_from_points};
+use super::{DensityConfig, Keyframe, KeyframeId, MappingConfig, MappingError, PoseUpdate, exposure, initialise_from_points};
 use crate::geometry::Se3;
 use crate::gpu::Gpu;
-use crate::optimise::{AdamConfig, ScoredMap, Trainer, TrainingView};
+use crate::optimise::{AdamConfig, DensityPasses, OverScores, Trainer, TrainingView};
 use crate::render::{GpuCloud, Rendered};
 use crate::sequence::{KnownPoint, RectifiedImage};
 use crate::splat::{Exposure, GaussianCloud, ViewCamera};
@@ -69,7 +69,8 @@ pub struct Mapper {
     gpu: Arc<Gpu>,
     trainer: Trainer,
     cloud: GpuCloud,
-    stats: GaussianStats,
+    anchors: Anchors,
+    density: DensityPasses,
     keyframes: Vec<MappedKeyframe>,
     /// Images beyond those on the GPU.
     images: ImageStore,
@@ -92,7 +93,8 @@ impl Mapper {
             config: Arc::new(config.clone()),
             trainer: Trainer::new(gpu.clone())?,
             cloud: GpuCloud::new(&gpu, config.sh_degree, FIRST_CAPACITY)?,
-            stats: GaussianStats::default(),
+            anchors: Anchors::default(),
+            density: DensityPasses::new(&gpu)?,
             keyframes: Vec::new(),
             images: ImageStore::new(config.limits.max_host_bytes),
             rng: Rng::with_seed(config.seed),
@@ -152,7 +154,7 @@ impl Mapper {
             new = new.thinned(self.cloud.most(&self.gpu) - self.cloud.len());
         }
         let left_out = self.cloud.append(&self.gpu, &new)?;
-        self.stats.append(anchor, new.len() - left_out);
+        self.anchors.append(anchor, new.len() - left_out);
         Ok(())
     }
 
@@ -170,7 +172,7 @@ impl Mapper {
                 motions.extend(motion.map(|motion| (keyframe.id, motion)));
             }
         }
-        let moved = self.stats.moved(&motions);
+        let moved = self.anchors.moved(&motions);
         self.cloud.transform(&self.gpu, &moved)?;
         Ok(moved.iter().map(|motion| motion.run.len()).sum())
     }
@@ -271,14 +273,14 @@ impl Mapper {
             scoring.splice(..0, before.drain(..));
         }
         let mut taken = self.take(&before, &config.adam, stop)?;
+        self.cloud.begin_round();
+        let (mut pruned, mut grown) = (0, 0);
         if controlled {
             self.trainer.begin_scores(&self.cloud)?;
+            let scored = self.take_scored(&scoring, &config.adam, density)?;
+            taken += scored.0;
+            (pruned, grown) = self.timed("density", |mapper| mapper.control_density(scored.1, density))?;
         }
-        taken += self.take(&scoring, &config.adam, &|| false)?;
-        self.stats.keyframe_mapped();
-        let scored = taken.scored.take();
-        let control = |mapper: &mut Self| mapper.control_density(scored, density);
-        let (pruned, grown) = if controlled { self.timed("density", control)? } else { (0, 0) };
         let rest = self.with_consolidation(after);
         taken += self.take(&rest, &config.adam, stop)?;
         if config.yields_to_keyframes {
@@ -295,9 +297,27 @@ impl Mapper {
             if stop() {
                 break;
             }
-            taken += self.timed("steps", |mapper| mapper.steps(batch, adam))?;
+            taken += self.timed("steps", |mapper| mapper.steps(batch, adam, None))?.0;
         }
         Ok(taken)
+    }
+
+    /// Takes steps, in batches, and returns with them the verdicts of density control after the last one, `[N]`; none without steps.
+    fn take_scored(
+        &mut self,
+        steps: &[Step],
+        adam: &AdamConfig,
+        density: &DensityConfig,
+    ) -> Result<(Taken, Vec<u32>), MappingError> {
+        let (mut taken, mut verdicts) = (Taken::default(), Vec::new());
+        let mut batches = steps.chunks(self.batch()).peekable();
+        while let Some(batch) = batches.next() {
+            let judged = batches.peek().is_none().then_some(density);
+            let (more, read) = self.timed("steps", |mapper| mapper.steps(batch, adam, judged))?;
+            taken += more;
+            verdicts = read;
+        }
+        Ok((taken, verdicts))
     }
 
     /// Steps submitted at once.
@@ -305,7 +325,13 @@ impl Mapper {
         if self.config.yields_to_keyframes { YIELDING_BATCH } else { BATCH }
     }
 
-    fn steps(&mut self, batch: &[Step], adam: &AdamConfig) -> Result<Taken, MappingError> {
+    /// Takes a batch of steps; returns with them the verdicts of density control, if wanted.
+    fn steps(
+        &mut self,
+        batch: &[Step],
+        adam: &AdamConfig,
+        judged: Option<&DensityConfig>,
+    ) -> Result<(Taken, Vec<u32>), MappingError> {
         let streamed = batch.iter().map(|step| self.keyframes[step.keyframe].streamed(step.coarse, &self.images));
         let streamed = streamed.collect::<Result<Vec<_>, _>>()?;
         let views = batch.iter().zip(&streamed).map(|(step, pixels)| {
@@ -316,27 +342,30 @@ impl Mapper {
         });
         let views: Vec<TrainingView<'_>> = views.collect();
         let started = Instant::now();
-        let (reports, scored) = self.trainer.steps_and_scores(&self.cloud, &views, &self.config.loss, adam)?;
+        if let Some(density) = judged {
+            self.density.prepare(&self.gpu, &density.setup(&self.map_size()))?;
+        }
+        let judge = judged.map(|_| self.density.verdicts(&self.gpu, &self.cloud));
+        let then = judge.as_ref().map(|judge| judge as &dyn OverScores);
+        let (reports, verdicts) = self.trainer.steps_and_then(&self.cloud, &views, (&self.config.loss, adam), then)?;
         self.step_times.extend(std::iter::repeat_n(started.elapsed() / batch.len().max(1) as u32, batch.len()));
-        let mut taken = Taken { steps: batch.len(), psnr_sum: 0.0, scored };
+        let mut taken = Taken { steps: batch.len(), psnr_sum: 0.0 };
         for (step, report) in batch.iter().zip(&reports) {
             if !report.loss.total(&self.config.loss).is_finite() {
                 return Err(MappingError::NotFinite { id: self.keyframes[step.keyframe].id });
             }
             taken.psnr_sum += report.loss.psnr_db();
         }
-        Ok(taken)
+        Ok((taken, verdicts))
     }
 }
 
 /// Steps taken.
-#[derive(Debug, Default)]
+#[derive(Clone, Copy, Debug, Default)]
 struct Taken {
     steps: usize,
     /// Of the PSNR of each step's view before it.
     psnr_sum: f32,
-    /// After the last of them, if it was scored.
-    scored: Option<ScoredMap>,
 }
 
 impl Taken {
@@ -349,6 +378,5 @@ impl std::ops::AddAssign for Taken {
     fn add_assign(&mut self, more: Self) {
         self.steps += more.steps;
         self.psnr_sum += more.psnr_sum;
-        self.scored = more.scored;
     }
 }

@@ -1,11 +1,11 @@
 //! The mapping thread's work: keyframes in, Gaussians inserted, optimised over a sliding window and pruned, snapshots out.
 //! A refinement over all keyframes may follow. Knows nothing of tracking; poses and covisibility arrive with the keyframes.
 
+mod anchors;
 mod config;
 mod density;
 mod error;
 mod exposure;
-mod gaussian_stats;
 mod host_time;
 mod image_store;
 mod initialise_from_points;

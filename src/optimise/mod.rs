@@ -1,6 +1,7 @@
 //! Moving the map towards the keyframes: the image loss, its gradient, and Adam, all on the GPU.
 
 mod adam;
+mod density;
 mod image_buffers;
 mod kernels;
 mod loss;
@@ -8,6 +9,7 @@ mod scores;
 mod trainer;
 
 pub use adam::AdamConfig;
+pub use density::{DensityPasses, Verdicts};
 pub use loss::{LossConfig, LossTerms, Pixels, TargetImage, ssim_phase};
-pub use scores::{ErrorPixels, GaussianScore, ScoredMap};
+pub use scores::{ErrorPixels, GaussianScore, OverScores};
 pub use trainer::{Gradients, ImageGradients, StepReport, Trainer, TrainerState, TrainingView};

@@ -1,9 +1,9 @@
 //! Scores of the Gaussians over some views, for density control: computed beside a training step, from its own tile lists and gradients.
 
 use super::LossConfig;
-use crate::gpu::{Gpu, GpuBuffer, GpuError, IndirectSize, Kernel, Part, ReadBack, UniformCell};
+use crate::gpu::{Gpu, GpuBuffer, GpuError, IndirectSize, Kernel, Part, UniformCell};
 use crate::render::layout::{Counter, ScoreSetup, VISIBLE_COUNTER};
-use crate::render::{BlendForm, GaussianGeometry, GpuCloud, PreparedView, Rasterizer, shaders};
+use crate::render::{BlendForm, GpuCloud, PreparedView, Rasterizer, shaders};
 
 /// Definition of an error pixel (the high-error mask of FastGS).
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -44,13 +44,13 @@ pub struct GaussianScore {
     pub metres_per_pixel: f32,
 }
 
-/// The Gaussians after scored steps, `[N]` in map order.
-#[derive(Clone, Debug, Default)]
-pub struct ScoredMap {
-    /// What the scored views say of them.
-    pub scores: Vec<GaussianScore>,
-    /// Averaged over recent steps.
-    pub geometry: Vec<GaussianGeometry>,
+/// A pass that follows scored steps in their submission, and what it leaves to be read.
+pub trait OverScores {
+    /// Encodes it; `scores` are `[2, capacity]` vec4 as `shaders/gather_scores.wgsl` has them.
+    fn encode(&self, pass: &mut wgpu::ComputePass<'_>, scores: &GpuBuffer);
+
+    /// To be read after it, u32 each.
+    fn part(&self) -> Part<'_>;
 }
 
 /// A rendered image with its loss.
@@ -135,27 +135,31 @@ impl Scores {
         self.gather.dispatch_indirect(gpu, pass, &gather, visible);
     }
 
-    /// The sums over all views since the last clearing, to be read back.
-    pub fn parts(&self, cloud: &GpuCloud) -> [Part<'_>; 2] {
+    /// `[2, capacity]` vec4: the sums over all views since the last clearing.
+    pub fn buffer(&self) -> &GpuBuffer {
+        &self.scores
+    }
+
+    /// The same, of all Gaussians.
+    pub fn read(&self, gpu: &Gpu, cloud: &GpuCloud) -> Result<Vec<GaussianScore>, GpuError> {
         assert_eq!(self.capacity, cloud.capacity(), "the scores are those of this cloud");
-        [0, self.capacity].map(|first| self.scores.part::<[f32; 4]>(first, cloud.len()))
+        let read = gpu.read(None, &[0, self.capacity].map(|first| self.scores.part::<[f32; 4]>(first, cloud.len())))?;
+        Ok(read.part(0).into_iter().zip(read.part(1)).map(GaussianScore::from_planes).collect())
     }
 }
 
 impl GaussianScore {
-    /// Those of a map, `[N]`; their parts are `first` and the next one.
-    pub(crate) fn of(read: &ReadBack<'_>, first: usize) -> Vec<Self> {
-        let (seen, gradients): (Vec<[f32; 4]>, Vec<[f32; 4]>) = (read.part(first), read.part(first + 1));
-        let score = |(s, g): (&[f32; 4], &[f32; 4])| GaussianScore {
-            error_pixels: s[0],
-            weighted_error_pixels: s[1],
-            weight_sum: s[2],
-            weight_max: s[3],
-            gradient: g[0],
-            absolute_gradient: g[1],
-            views: g[2],
-            metres_per_pixel: g[3],
-        };
-        seen.iter().zip(&gradients).map(score).collect()
+    /// One from its two vectors, see `shaders/gather_scores.wgsl`.
+    fn from_planes((seen, by_view): ([f32; 4], [f32; 4])) -> Self {
+        Self {
+            error_pixels: seen[0],
+            weighted_error_pixels: seen[1],
+            weight_sum: seen[2],
+            weight_max: seen[3],
+            gradient: by_view[0],
+            absolute_gradient: by_view[1],
+            views: by_view[2],
+            metres_per_pixel: by_view[3],
+        }
     }
 }

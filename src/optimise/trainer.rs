@@ -1,22 +1,23 @@
 //! One training step on the GPU: forward, loss, backward, Adam; and the same without stepping, for whoever wants the gradients.
 
 mod encode;
+mod gradients;
 mod state;
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+pub use gradients::{Gradients, ImageGradients};
 pub use state::TrainerState;
 
 use super::image_buffers::{self, ImageBuffers};
 use super::kernels::Kernels;
-use super::scores::{ErrorPixels, GaussianScore, ScoredImage, ScoredMap, Scores};
+use super::scores::{ErrorPixels, GaussianScore, OverScores, ScoredImage, Scores};
 use super::{AdamConfig, LossConfig, LossTerms, Pixels, TargetImage};
-use crate::geometry::Pinhole;
 use crate::gpu::{Gpu, GpuBuffer, GpuError};
 use crate::render::layout::StepLog;
 use crate::render::{BlendForm, GpuCloud, Rasterizer, Rendered, ViewCounts};
-use crate::splat::{Exposure, GaussianCloud, ViewCamera};
+use crate::splat::{Exposure, ViewCamera};
 
 /// What a step did.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -50,24 +51,6 @@ impl<'a> TrainingView<'a> {
         let exposure = Exposure::default();
         Self { camera, target, streamed: None, scored: None, depth_confidence: 1.0, exposure }
     }
-}
-
-/// Gradient of a loss by the map.
-#[derive(Clone, Debug)]
-pub struct Gradients {
-    /// Terms of the image loss.
-    pub loss: LossTerms,
-    /// By the raw parameters of each Gaussian, in the shape of the map.
-    pub cloud: GaussianCloud,
-}
-
-/// Gradient of a loss by a rendered image.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct ImageGradients {
-    /// `[H, W]` by colour (r, g, b) and by Σ w z, 1/metres.
-    pub color_depth: Vec<[f32; 4]>,
-    /// `[H, W]` by alpha.
-    pub alpha: Vec<f32>,
 }
 
 /// Where the backward pass starts from.
@@ -154,30 +137,30 @@ impl Trainer {
         loss: &LossConfig,
         adam: &AdamConfig,
     ) -> Result<Vec<StepReport>, GpuError> {
-        Ok(self.steps_and_scores(cloud, views, loss, adam)?.0)
+        Ok(self.steps_and_then(cloud, views, (loss, adam), None)?.0)
     }
 
-    /// The same; with the scores since [`Self::begin_scores`] if the last views are scored, read in the same wait.
+    /// The same, with a pass over the scores since [`Self::begin_scores`] behind the last step, and what is to be read of it in the same wait.
+    /// Where steps are repeated, so is the pass: it must not add to what it did before.
     ///
     /// # Errors
     /// [`GpuError`] if a buffer does not fit or the device fails.
-    pub fn steps_and_scores(
+    pub fn steps_and_then(
         &mut self,
         cloud: &GpuCloud,
         views: &[TrainingView<'_>],
-        loss: &LossConfig,
-        adam: &AdamConfig,
-    ) -> Result<(Vec<StepReport>, Option<ScoredMap>), GpuError> {
+        rules: (&LossConfig, &AdamConfig),
+        then: Option<&dyn OverScores>,
+    ) -> Result<(Vec<StepReport>, Vec<u32>), GpuError> {
         let mut reports = vec![StepReport::default(); views.len()];
-        let with_scores = views.last().is_some_and(|view| view.scored.is_some());
-        let mut scored = None;
+        let mut words = Vec::new();
         let mut pending: Vec<usize> = (0..views.len()).collect();
         while !pending.is_empty() {
             let mut repeat = Vec::new();
             for chunk in pending.chunks(STEPS_AT_ONCE) {
                 let chosen: Vec<&TrainingView<'_>> = chunk.iter().map(|&i| &views[i]).collect();
-                let (logs, scores) = self.steps_at_once(cloud, &chosen, with_scores, loss, adam)?;
-                scored = scores;
+                let (logs, read) = self.steps_at_once(cloud, &chosen, rules, then)?;
+                words = read;
                 for (&i, log) in chunk.iter().zip(&logs) {
                     let pixels = views[i].target.width * views[i].target.height;
                     match self.rasterizer.counts(&log.counters) {
@@ -189,19 +172,18 @@ impl Trainer {
             }
             pending = repeat;
         }
-        Ok((reports, scored))
+        Ok((reports, words))
     }
 
-    /// Takes up to [`STEPS_AT_ONCE`] steps and reads their logs, with the scores if wanted. They are one submission where their views
-    /// have one size, and none of them but the first streams its target.
+    /// Takes up to [`STEPS_AT_ONCE`] steps and reads their logs. They are one submission where their views have one size, and none of them but
+    /// the first streams its target.
     fn steps_at_once(
         &mut self,
         cloud: &GpuCloud,
         views: &[&TrainingView<'_>],
-        with_scores: bool,
-        loss: &LossConfig,
-        adam: &AdamConfig,
-    ) -> Result<(Vec<StepLog>, Option<ScoredMap>), GpuError> {
+        (loss, adam): (&LossConfig, &AdamConfig),
+        then: Option<&dyn OverScores>,
+    ) -> Result<(Vec<StepLog>, Vec<u32>), GpuError> {
         let gpu = self.rasterizer.gpu().clone();
         let size = |view: &TrainingView<'_>| (view.target.width, view.target.height);
         let mut unsubmitted = None;
@@ -219,22 +201,36 @@ impl Trainer {
                 self.steps += 1;
                 taken += 1;
             }
+            if let Some(then) = then.filter(|_| taken == views.len()) {
+                then.encode(&mut pass, self.scores.buffer());
+            }
             drop(pass);
             self.rasterizer.uniforms.upload(&gpu);
             unsubmitted = Some(encoder);
             self.encode_time += started.elapsed();
         }
         let words = LOG_STRIDE / std::mem::size_of::<u32>();
-        let mut parts = vec![self.log.part::<u32>(0, taken * words)];
-        if with_scores {
-            parts.extend(self.scores.parts(cloud));
-            parts.extend(cloud.geometry_parts());
-        }
-        let read = gpu.read(unsubmitted, &parts)?;
+        let logs = self.log.part::<u32>(0, taken * words);
+        let read = gpu.read(unsubmitted, &std::iter::once(logs).chain(then.map(OverScores::part)).collect::<Vec<_>>())?;
         let entry = |log: &[u32]| bytemuck::pod_read_unaligned(&bytemuck::cast_slice(log)[..std::mem::size_of::<StepLog>()]);
         let logs = read.part::<u32>(0).chunks_exact(words).map(entry).collect();
-        let scored = with_scores.then(|| ScoredMap { scores: GaussianScore::of(&read, 1), geometry: cloud.geometry(&read, 3) });
-        Ok((logs, scored))
+        Ok((logs, then.map_or_else(Vec::new, |_| read.part(1))))
+    }
+
+    /// A pass over the scores by itself, and what is to be read of it.
+    ///
+    /// # Errors
+    /// [`GpuError`] if the device fails.
+    pub fn over_scores(&self, then: &dyn OverScores) -> Result<Vec<u32>, GpuError> {
+        let gpu = self.rasterizer.gpu();
+        let mut encoder = gpu.device.create_command_encoder(&Default::default());
+        then.encode(&mut encoder.begin_compute_pass(&Default::default()), self.scores.buffer());
+        Ok(gpu.read(Some(encoder), &[then.part()])?.part(0))
+    }
+
+    /// `[2, capacity]` vec4 as `shaders/gather_scores.wgsl` has them, for passes that need nothing read.
+    pub fn scores(&self) -> &GpuBuffer {
+        self.scores.buffer()
     }
 
     /// Renders a view over `background` and reads it back.
@@ -267,92 +263,12 @@ impl Trainer {
     /// # Errors
     /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn read_scores(&self, cloud: &GpuCloud) -> Result<Vec<GaussianScore>, GpuError> {
-        let read = self.rasterizer.gpu().read(None, &self.scores.parts(cloud))?;
-        Ok(GaussianScore::of(&read, 0))
+        self.scores.read(self.rasterizer.gpu(), cloud)
     }
 
     /// The host's time to encode and submit all steps so far.
     pub fn encode_time(&self) -> Duration {
         self.encode_time
-    }
-
-    /// The same, but returns the gradients and moves nothing.
-    ///
-    /// # Errors
-    /// [`GpuError`] if a buffer does not fit or the device fails.
-    pub fn gradients(
-        &mut self,
-        cloud: &GpuCloud,
-        camera: &ViewCamera,
-        target: &TargetImage,
-        loss: &LossConfig,
-    ) -> Result<Gradients, GpuError> {
-        let gpu = self.rasterizer.gpu().clone();
-        let objective = Objective::Image { view: TrainingView::new(*camera, target), loss, log: 0 };
-        let mut gradients = self.collect(cloud, camera, [0.0; 3], &objective)?;
-        let loss: Vec<[f32; 4]> = self.logs[0].read(&gpu, 0, 1)?;
-        gradients.loss = LossTerms::from_sums(loss[0], target.width * target.height);
-        Ok(gradients)
-    }
-
-    /// Gradients of any loss by the map, from its gradients by the image; moves nothing.
-    ///
-    /// # Errors
-    /// [`GpuError`] if a buffer does not fit or the device fails.
-    pub fn gradients_from_image(
-        &mut self,
-        cloud: &GpuCloud,
-        camera: &ViewCamera,
-        background: [f32; 3],
-        by_image: &ImageGradients,
-    ) -> Result<Gradients, GpuError> {
-        let gpu = self.rasterizer.gpu().clone();
-        let Pinhole { width, height, .. } = camera.pinhole;
-        image_buffers::choose(&mut self.images, &gpu, (width, height))?;
-        self.images[0].gradients.write(&gpu, 0, &by_image.color_depth);
-        let alpha: Vec<[f32; 4]> = by_image.alpha.iter().map(|a| [*a, 0.0, 0.0, 0.0]).collect();
-        self.images[0].gradients.write(&gpu, by_image.color_depth.len(), &alpha);
-        self.collect(cloud, camera, background, &Objective::Given)
-    }
-
-    fn collect(
-        &mut self,
-        cloud: &GpuCloud,
-        camera: &ViewCamera,
-        background: [f32; 3],
-        objective: &Objective<'_>,
-    ) -> Result<Gradients, GpuError> {
-        let gpu = self.rasterizer.gpu().clone();
-        let sink = GpuBuffer::storage(&gpu, "gradients", cloud.parameters().size())?;
-        self.run(cloud, &Viewpoint { camera, background }, objective, &Sink::Gradient(&sink))?;
-        let cloud = cloud.read_planes(&gpu, &sink)?;
-        Ok(Gradients { loss: LossTerms::default(), cloud })
-    }
-
-    /// Submits one step and waits, again with larger buffers if its intersections did not fit.
-    fn run(
-        &mut self,
-        cloud: &GpuCloud,
-        viewpoint: &Viewpoint<'_>,
-        objective: &Objective<'_>,
-        sink: &Sink<'_>,
-    ) -> Result<(), GpuError> {
-        let gpu = self.rasterizer.gpu().clone();
-        loop {
-            let mut encoder = gpu.device.create_command_encoder(&Default::default());
-            if let Sink::Gradient(buffer) = sink {
-                gpu.clear(&mut encoder, buffer, 0, None);
-            }
-            let mut pass = encoder.begin_compute_pass(&Default::default());
-            self.rasterizer.uniforms.begin();
-            self.encode(&mut pass, cloud, viewpoint, objective, sink)?;
-            drop(pass);
-            self.rasterizer.uniforms.upload(&gpu);
-            gpu.submit(encoder);
-            if self.rasterizer.finish()?.is_some() {
-                return Ok(());
-            }
-        }
     }
 
     /// Encodes one whole step.

@@ -1,16 +1,17 @@
-//! The map's Gaussians on the GPU: parameters, Adam's moments and averages of the parameters, in planes of vec4.
+//! The map's Gaussians on the GPU: parameters, Adam's moments, averages of the parameters, and histories, in planes of vec4.
 
+mod change;
 mod motion;
 
+use bytemuck::{Pod, Zeroable};
 use glam::{Quat, Vec3};
 use serde::{Deserialize, Serialize};
 
 pub use motion::RunMotion;
 
-use super::layout::{BlendForm, GEOMETRY_PLANES, GatherSetup};
-use super::plan::{GaussianGeometry, Plan};
-use super::shaders;
-use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, Part, ReadBack, plain, workgroups};
+use self::change::Kernels;
+use super::layout::GEOMETRY_PLANES;
+use crate::gpu::{Gpu, GpuBuffer, GpuError, Part, Uniforms, plain};
 use crate::splat::{GaussianCloud, ShDegree};
 
 /// Parameters, first and second moments, averages.
@@ -19,6 +20,20 @@ const BUFFERS: usize = 4;
 const MARGIN_DIVISOR: u64 = 4;
 /// The map grows by an eighth of itself at least.
 const LEAST_GROWTH_DIVISOR: usize = 8;
+
+/// What density control remembers of a Gaussian.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
+pub struct GaussianHistory {
+    /// Scored views that blended it, ever.
+    pub views: f32,
+    /// The most that it added to a pixel of these, 0 to 1.
+    pub best_weight: f32,
+    /// The most that it added to one view, pixels.
+    pub contribution: f32,
+    /// Round of density control in which it came.
+    pub came: f32,
+}
 
 /// Gaussians on the GPU, `[planes, capacity]` vec4 in each buffer. Plane 0 holds position and raw opacity, 1 the log scale,
 /// 2 the rotation (w, x, y, z), 3 the constant colour, 4… the other harmonics, RGB each.
@@ -36,9 +51,15 @@ pub struct GpuCloud {
     moments_2: GpuBuffer,
     /// Exponential moving average of the parameters.
     averages: GpuBuffer,
+    /// `[capacity]` [`GaussianHistory`].
+    histories: GpuBuffer,
+    /// Rounds of density control so far.
+    rounds: u32,
     /// As large as the others: a change gathers one of them into it, the next into that one, and so on, so that it needs no memory.
     spare: Option<GpuBuffer>,
-    gather: Kernel,
+    spare_histories: Option<GpuBuffer>,
+    kernels: Kernels,
+    uniforms: Uniforms,
 }
 
 /// A map with its moments and averages, read back.
@@ -47,9 +68,13 @@ pub struct CloudState {
     capacity: usize,
     limit: Option<usize>,
     room: Option<usize>,
+    rounds: u32,
     /// `[BUFFERS, planes, N]`: parameters, first and second moments, averages.
     #[serde(with = "plain")]
     values: Vec<[f32; 4]>,
+    /// `[N]`
+    #[serde(with = "plain")]
+    histories: Vec<GaussianHistory>,
 }
 
 impl GpuCloud {
@@ -70,8 +95,12 @@ impl GpuCloud {
             moments_1: planes()?,
             moments_2: planes()?,
             averages: planes()?,
+            histories: allocate_histories(gpu, capacity)?,
+            rounds: 0,
             spare: None,
-            gather: Kernel::new(gpu, "gather", "main", &shaders::GATHER.text(BlendForm::default())),
+            spare_histories: None,
+            kernels: Kernels::new(gpu),
+            uniforms: Uniforms::new(gpu)?,
         })
     }
 
@@ -95,14 +124,15 @@ impl GpuCloud {
         self.sh_degree
     }
 
-    /// Bytes that there is to be room for with each Gaussian: parameters, two moments, averages, and a spare for changes.
+    /// Bytes that there is to be room for with each Gaussian: parameters, two moments, averages, history, and spares for changes.
     pub fn bytes_each(&self) -> u64 {
-        ((BUFFERS + 1) * self.planes() * 16) as u64
+        ((BUFFERS + 1) * self.planes() * 16 + 2 * size_of::<GaussianHistory>()) as u64
     }
 
     /// Bytes that it has at present.
     pub fn bytes(&self) -> u64 {
-        self.buffers().into_iter().chain(&self.spare).map(|buffer| buffer.size()).sum()
+        let histories = [Some(&self.histories), self.spare_histories.as_ref()].into_iter().flatten();
+        self.buffers().into_iter().chain(&self.spare).chain(histories).map(GpuBuffer::size).sum()
     }
 
     /// Buffers are made for at most `limit` Gaussians from now on; whoever appends must keep to it.
@@ -157,50 +187,19 @@ impl GpuCloud {
         &self.averages
     }
 
-    /// Appends Gaussians with zero moments. Those that hold a NaN or an infinity are left out; their number is returned.
-    ///
-    /// # Errors
-    /// [`GpuError`] if a buffer does not fit or the device fails.
-    pub fn append(&mut self, gpu: &Gpu, cloud: &GaussianCloud) -> Result<usize, GpuError> {
-        assert_eq!(cloud.sh_degree, self.sh_degree, "a map has one spherical-harmonics degree");
-        let finite: Vec<usize> = (0..cloud.len()).filter(|&i| is_finite(cloud, i)).collect();
-        let capacity = self.capacity_for(gpu, self.count + finite.len());
-        if capacity > self.capacity {
-            let all: Vec<u32> = (0..self.count as u32).collect();
-            self.rebuild(gpu, &all, capacity)?;
-        }
-        let zeros = vec![[0.0f32; 4]; finite.len()];
-        for plane in 0..self.planes() {
-            let values: Vec<[f32; 4]> = finite.iter().map(|&i| plane_value(cloud, plane, i)).collect();
-            let first = plane * self.capacity + self.count;
-            self.parameters.write(gpu, first, &values);
-            self.averages.write(gpu, first, &values);
-            self.moments_1.write(gpu, first, &zeros);
-            self.moments_2.write(gpu, first, &zeros);
-        }
-        self.count += finite.len();
-        Ok(cloud.len() - finite.len())
+    /// What density control remembers of each Gaussian, `[capacity]` [`GaussianHistory`].
+    pub fn histories(&self) -> &GpuBuffer {
+        &self.histories
     }
 
-    /// Applies a plan to the parameters, their averages and the moments. A child inherits its parent's moments.
-    ///
-    /// # Errors
-    /// [`GpuError`] if a buffer does not fit.
-    pub fn apply(&mut self, gpu: &Gpu, plan: &Plan) -> Result<(), GpuError> {
-        let sources: Vec<u32> = plan.keep.iter().copied().chain(plan.parents()).collect();
-        let capacity = self.capacity_for(gpu, sources.len());
-        if plan.keep.len() == self.count && plan.children.is_empty() && capacity == self.capacity {
-            return Ok(());
-        }
-        self.rebuild(gpu, &sources, capacity)?;
-        let first = plan.keep.len();
-        let positions: Vec<[f32; 4]> = plan.children.iter().map(|c| c.mean.extend(c.raw_opacity).into()).collect();
-        let scales: Vec<[f32; 4]> = plan.children.iter().map(|c| c.log_scale.extend(0.0).into()).collect();
-        for (plane, values) in [positions, scales].iter().enumerate() {
-            self.parameters.write(gpu, plane * self.capacity + first, values);
-            self.averages.write(gpu, plane * self.capacity + first, values);
-        }
-        Ok(())
+    /// Rounds of density control so far, from which a Gaussian's age follows.
+    pub fn rounds(&self) -> u32 {
+        self.rounds
+    }
+
+    /// Another round of density control: all Gaussians are older by one.
+    pub fn begin_round(&mut self) {
+        self.rounds += 1;
     }
 
     /// Room for `needed` Gaussians: the present one, or twice as much within the limit and what the adapter can bind; if that is too
@@ -213,68 +212,9 @@ impl GpuCloud {
         needed.next_power_of_two().min(limit).min(self.most(gpu)).max(needed)
     }
 
-    /// The Gaussians at `chosen`, in this order, with room for `capacity`. Buffers are replaced one at a time: the old and the new ones never
-    /// stand beside each other in full.
-    fn rebuild(&mut self, gpu: &Gpu, chosen: &[u32], capacity: usize) -> Result<(), GpuError> {
-        let list = GpuBuffer::storage(gpu, "chosen", (chosen.len() * 4) as u64)?;
-        list.write(gpu, 0, chosen);
-        let setup = GatherSetup {
-            count: chosen.len() as u32,
-            planes: self.planes() as u32,
-            capacity_in: self.capacity as u32,
-            capacity_out: capacity as u32,
-        };
-        let setup = GpuBuffer::uniform(gpu, "gather setup", &setup)?;
-        let size = workgroups((chosen.len() as u32).div_ceil(256));
-        let (sh_degree, resized) = (self.sh_degree, capacity != self.capacity);
-        let Self { parameters, moments_1, moments_2, averages, spare, gather, .. } = self;
-        for buffer in [parameters, moments_1, moments_2, averages] {
-            // An old one of another size is given back before the new one is made.
-            let to = match spare.take().filter(|_| !resized) {
-                Some(spare) => spare,
-                None => allocate(gpu, sh_degree, capacity)?,
-            };
-            let mut encoder = gpu.device.create_command_encoder(&Default::default());
-            let mut pass = encoder.begin_compute_pass(&Default::default());
-            gather.dispatch(gpu, &mut pass, &[(0, &setup), (1, &list), (2, buffer), (3, &to)], size);
-            drop(pass);
-            gpu.submit(encoder);
-            *spare = Some(std::mem::replace(buffer, to));
-        }
-        if resized {
-            *spare = None;
-        }
-        (self.count, self.capacity) = (chosen.len(), capacity);
-        Ok(())
-    }
-
     /// All of them, in the order of [`CloudState`].
     fn buffers(&self) -> [&GpuBuffer; BUFFERS] {
         [&self.parameters, &self.moments_1, &self.moments_2, &self.averages]
-    }
-
-    /// Downloads the averaged geometry of all Gaussians, `[N]` in map order. Blocks until the GPU is idle.
-    ///
-    /// # Errors
-    /// [`GpuError`] if the device fails.
-    pub fn read_geometry(&self, gpu: &Gpu) -> Result<Vec<GaussianGeometry>, GpuError> {
-        Ok(self.geometry(&gpu.read(None, &self.geometry_parts())?, 0))
-    }
-
-    /// The same, to be read back with others.
-    pub(crate) fn geometry_parts(&self) -> [Part<'_>; GEOMETRY_PLANES] {
-        [0, 1, 2].map(|plane| self.averages.part::<[f32; 4]>(plane * self.capacity, self.count))
-    }
-
-    /// The averaged geometry of all Gaussians, `[N]` in map order; its parts are `first` and the following ones.
-    pub(crate) fn geometry(&self, read: &ReadBack<'_>, first: usize) -> Vec<GaussianGeometry> {
-        let [positions, scales, rotations] = [0, 1, 2].map(|plane| read.part::<[f32; 4]>(first + plane));
-        let geometry = |i: usize| {
-            let ([x, y, z, raw_opacity], [a, b, c, _], [qw, qx, qy, qz]) = (positions[i], scales[i], rotations[i]);
-            let (mean, log_scale, rotation) = (Vec3::new(x, y, z), Vec3::new(a, b, c), Quat::from_xyzw(qx, qy, qz, qw));
-            GaussianGeometry { mean, raw_opacity, log_scale, rotation }
-        };
-        (0..self.count).map(geometry).collect()
     }
 
     /// The filled part of each plane of a buffer of the map's shape, `[N]` vec4.
@@ -308,7 +248,8 @@ impl GpuCloud {
             let read = gpu.read(None, &self.parts(buffer).collect::<Vec<_>>())?;
             (0..self.planes()).for_each(|plane| values.extend(read.part::<[f32; 4]>(plane)));
         }
-        Ok(CloudState { capacity: self.capacity, limit: self.limit, room: self.room, values })
+        let Self { capacity, limit, room, rounds, .. } = *self;
+        Ok(CloudState { capacity, limit, room, rounds, values, histories: self.histories.read(gpu, 0, self.count)? })
     }
 
     /// The map of a state, to the bit; `None` if that is no map of this degree.
@@ -318,11 +259,12 @@ impl GpuCloud {
     pub fn restore(gpu: &Gpu, sh_degree: ShDegree, state: &CloudState) -> Result<Option<Self>, GpuError> {
         let planes = planes(sh_degree);
         let count = state.values.len() / (BUFFERS * planes);
-        if state.values.len() != BUFFERS * planes * count || state.capacity < count {
+        if state.values.len() != BUFFERS * planes * count || state.capacity < count || state.histories.len() != count {
             return Ok(None);
         }
         let mut cloud = Self::new(gpu, sh_degree, state.capacity)?;
-        (cloud.count, cloud.limit, cloud.room) = (count, state.limit, state.room);
+        (cloud.count, cloud.limit, cloud.room, cloud.rounds) = (count, state.limit, state.room, state.rounds);
+        cloud.histories.write(gpu, 0, &state.histories);
         let buffers = cloud.buffers();
         for (i, plane) in state.values.chunks_exact(count.max(1)).enumerate() {
             buffers[i / planes].write(gpu, (i % planes) * cloud.capacity, plane);
@@ -351,21 +293,10 @@ fn cloud_from_planes(sh_degree: ShDegree, read: &[Vec<[f32; 4]>]) -> GaussianClo
     }
 }
 
-fn plane_value(cloud: &GaussianCloud, plane: usize, i: usize) -> [f32; 4] {
-    let with = |v: Vec3, w: f32| [v.x, v.y, v.z, w];
-    let q = cloud.rotations[i];
-    match plane {
-        0 => with(cloud.means[i], cloud.raw_opacities[i]),
-        1 => with(cloud.log_scales[i], 0.0),
-        2 => [q.w, q.x, q.y, q.z],
-        _ => with(cloud.sh[i * cloud.sh_degree.coefficients() + plane - GEOMETRY_PLANES], 0.0),
-    }
-}
-
-fn is_finite(cloud: &GaussianCloud, i: usize) -> bool {
-    (0..planes(cloud.sh_degree)).all(|plane| plane_value(cloud, plane, i).iter().all(|v| v.is_finite()))
-}
-
 fn allocate(gpu: &Gpu, sh_degree: ShDegree, capacity: usize) -> Result<GpuBuffer, GpuError> {
     GpuBuffer::storage(gpu, "Gaussians", (planes(sh_degree) * capacity * 16) as u64)
+}
+
+fn allocate_histories(gpu: &Gpu, capacity: usize) -> Result<GpuBuffer, GpuError> {
+    GpuBuffer::storage(gpu, "histories", (capacity * size_of::<GaussianHistory>()) as u64)
 }

@@ -1,11 +1,14 @@
 //! What host and shaders must agree on: constants (this file is their one source) and the layouts of shared structs.
 
-use bytemuck::{Pod, Zeroable};
+mod twins;
+
 use nalgebra::Vector3;
 use serde::Serialize;
 
 use crate::gpu::{Gpu, workgroups};
 use crate::splat::model::*;
+
+pub use twins::*;
 
 /// A tile is 16×8 pixels. On the software adapter 16×16 takes twice as long to blend: small Gaussians leave most of it untouched.
 pub const TILE_WIDTH: u32 = 16;
@@ -25,6 +28,23 @@ pub const VISIBLE_COUNTER: u32 = 0;
 pub const INTERSECTION_COUNTER: u32 = 1;
 /// Number of counters.
 pub const COUNTERS: u32 = 2;
+
+/// Verdict of density control on a Gaussian: it stays as it is.
+pub const VERDICT_KEEP: u32 = 0;
+/// It goes.
+pub const VERDICT_REMOVE: u32 = 1;
+/// Two smaller ones may take its place.
+pub const VERDICT_SPLIT: u32 = 2;
+/// Two of its size may take its place.
+pub const VERDICT_CLONE: u32 = 3;
+/// Bit of a verdict: a view has blended the Gaussian.
+pub const SEEN: u32 = 4;
+/// Bit of a verdict: it is among the faint ones, of which half go.
+pub const FAINT: u32 = 8;
+/// Bits of a verdict; the others are those of its score.
+pub const VERDICT_BITS: u32 = 15;
+/// Bit of a parent in a list of changes: its children are of its own size.
+pub const DIVIDED_BY_CLONING: u32 = 1 << 31;
 
 /// Planes of vec4 that precede the higher harmonics: (position, raw opacity), (log scale, -), rotation (w, x, y, z), (constant colour, -).
 pub const GEOMETRY_PLANES: usize = 3;
@@ -137,6 +157,14 @@ pub fn wgsl_constants(form: BlendForm) -> String {
         ("SLOT_CHUNK", form.slot_chunk()),
         ("VISIBLE_COUNTER", VISIBLE_COUNTER),
         ("INTERSECTION_COUNTER", INTERSECTION_COUNTER),
+        ("VERDICT_KEEP", VERDICT_KEEP),
+        ("VERDICT_REMOVE", VERDICT_REMOVE),
+        ("VERDICT_SPLIT", VERDICT_SPLIT),
+        ("VERDICT_CLONE", VERDICT_CLONE),
+        ("SEEN", SEEN),
+        ("FAINT", FAINT),
+        ("VERDICT_BITS", VERDICT_BITS),
+        ("DIVIDED_BY_CLONING", DIVIDED_BY_CLONING),
     ];
     let floats = floats.iter().map(|(name, value)| format!("const {name}: f32 = {value:e};\n"));
     let integers = integers.iter().map(|(name, value)| format!("const {name}: u32 = {value}u;\n"));
@@ -197,179 +225,6 @@ impl Counter {
     /// Byte offset of a counter's indirect arguments with one workgroup per bucket of a tile's list.
     pub const fn per_bucket_offset(counter: u32) -> u64 {
         counter as u64 * Self::SIZE + 32
-    }
-}
-
-/// Declares host twins of WGSL structs, and lists their layouts so that `tests/shaders.rs` can compare them with the shaders.
-macro_rules! host_twins {
-    ($($(#[$doc:meta])* $name:ident { $($(#[$field_doc:meta])* $field:ident: $type:ty,)* })*) => {
-        $($(#[$doc])*
-        #[repr(C)]
-        #[derive(Clone, Copy, Debug, Pod, Zeroable)]
-        pub struct $name { $($(#[$field_doc])* pub $field: $type,)* })*
-
-        /// Layouts of all structs that host and shaders share: name, size, and the fields' offsets, all in bytes.
-        pub fn struct_layouts() -> Vec<(&'static str, usize, Vec<(&'static str, usize)>)> {
-            vec![
-                $((stringify!($name), size_of::<$name>(), vec![$((stringify!($field), std::mem::offset_of!($name, $field))),*]),)*
-            ]
-        }
-    };
-}
-
-host_twins! {
-    /// One camera view of the map (`shaders/shared/view.wgsl`).
-    View {
-        /// First row of camera_from_world, rotation and translation.
-        camera_row_0: [f32; 4],
-        /// Second row.
-        camera_row_1: [f32; 4],
-        /// Third row.
-        camera_row_2: [f32; 4],
-        /// Camera centre, metres; the last lane is unused.
-        center_in_world: [f32; 4],
-        /// fx, fy, cx, cy, pixels.
-        intrinsics: [f32; 4],
-        /// Bounds of x/z and y/z within which the projection is linearised: least x, most x, least y, most y.
-        tangent_bounds: [f32; 4],
-        /// RGB behind the map; the last lane is unused.
-        background: [f32; 4],
-        /// Image width, pixels.
-        width: u32,
-        /// Image height, pixels.
-        height: u32,
-        /// Tiles in a row.
-        tiles_x: u32,
-        /// Rows of tiles.
-        tiles_y: u32,
-        /// Gaussians in the map.
-        gaussian_count: u32,
-        /// Gaussians that the planes have space for.
-        capacity: u32,
-        /// Degree of the spherical harmonics, 0 to 3.
-        sh_degree: u32,
-        /// Tile intersections that the buffers have space for.
-        intersection_capacity: u32,
-    }
-    /// Counts made on the GPU, and the indirect dispatches that follow from them (`shaders/shared/counters.wgsl`).
-    #[derive(Default)]
-    Counter {
-        /// Elements, at most the capacity.
-        count: u32,
-        /// Elements that there would be with enough capacity.
-        needed: u32,
-        /// Workgroups for one lane an element.
-        per_element: [u32; 3],
-        /// Workgroups for one sorting block a workgroup.
-        per_block: [u32; 3],
-        /// Workgroups for one bucket of a tile's list a workgroup.
-        per_bucket: [u32; 3],
-    }
-    /// Which of the two prefix sums (`shaders/scan_blocks.wgsl`).
-    ScanSetup {
-        /// Counter that receives the total.
-        counter: u32,
-        /// Unused.
-        pad: [u32; 3],
-    }
-    /// What a step leaves behind (`shaders/loss_reduce.wgsl`).
-    StepLog {
-        /// Sums over the pixels: |colour error|, SSIM, |depth error|, squared colour error.
-        loss: [f32; 4],
-        /// Work of the view.
-        counters: [Counter; COUNTERS as usize],
-        /// Unused.
-        pad: [u32; 2],
-    }
-    /// One digit of a radix sort (`shaders/sort.wgsl`).
-    SortSetup {
-        /// Lowest bit of the digit.
-        shift: u32,
-        /// Counter that holds the number of keys.
-        counter: u32,
-        /// Unused.
-        pad: [u32; 2],
-    }
-    /// Mode of `shaders/shared/tile_rows.wgsl`.
-    TileListsSetup {
-        /// 0 counts tile intersections, 1 writes them.
-        emit: u32,
-        /// Unused.
-        pad: [u32; 3],
-    }
-    /// Compaction of the map's planes (`shaders/gather.wgsl`).
-    GatherSetup {
-        /// Gaussians that stay.
-        count: u32,
-        /// Planes of four floats.
-        planes: u32,
-        /// Gaussians that the source has space for.
-        capacity_in: u32,
-        /// Gaussians that the destination has space for.
-        capacity_out: u32,
-    }
-    /// Weights of the image loss (`shaders/loss_*.wgsl`).
-    LossSetup {
-        /// Image width, pixels.
-        width: u32,
-        /// Image height, pixels.
-        height: u32,
-        /// λ of SSIM against L1.
-        ssim_weight: f32,
-        /// Weight of the depth term, 1/metres.
-        depth_weight: f32,
-        /// Depth beyond which its weight falls with the square, metres.
-        precise_depth: f32,
-        /// Confidence of the depth image, 0 to 1.
-        depth_confidence: f32,
-        /// First pixel with a window of SSIM along x, 0 or 1.
-        phase_x: u32,
-        /// The same along y.
-        phase_y: u32,
-        /// Pixels of the image for each of its windows.
-        pixels_per_window: f32,
-        /// Factor from the recorded red to the map's.
-        red_gain: f32,
-        /// Factor from the recorded green to the map's.
-        green_gain: f32,
-        /// Factor from the recorded blue to the map's.
-        blue_gain: f32,
-    }
-    /// High-error mask (`shaders/shared/tile_scores.wgsl`).
-    ScoreSetup {
-        /// Factor of the mean absolute error above which a pixel is a high-error one.
-        error_ratio: f32,
-        /// Error below which no pixel is a high-error one.
-        noise: f32,
-        /// λ of SSIM against L1.
-        ssim_weight: f32,
-        /// Pixels of the image.
-        pixels: f32,
-    }
-    /// Learning rates by plane and lane, and decay rates (`shaders/shared/sink_adam.wgsl`).
-    AdamSetup {
-        /// Learning rates of the first five planes.
-        rates: [[f32; 4]; 5],
-        /// Decay of the first moment.
-        beta_1: f32,
-        /// Decay of the second moment.
-        beta_2: f32,
-        /// Offset of the denominator.
-        epsilon: f32,
-        /// Natural logarithm of `beta_1`.
-        log_beta_1: f32,
-        /// Natural logarithm of `beta_2`.
-        log_beta_2: f32,
-        /// Whether the higher harmonics take part in this step.
-        step_harmonics: u32,
-        /// Logarithm of the largest ratio of a Gaussian's longest axis to its second.
-        log_elongation: f32,
-        /// The colour's learning rate is divided by √(1 + this · steps of the Gaussian).
-        color_settling: f32,
-        /// Least share of the newest parameters in their average.
-        least_share: f32,
-        /// Unused.
-        pad: [f32; 3],
     }
 }
 

@@ -8,9 +8,9 @@ pub(crate) mod shaders;
 mod sort;
 mod workspace;
 
-pub use cloud::{CloudState, GpuCloud, RunMotion};
+pub use cloud::{CloudState, GaussianHistory, GpuCloud, RunMotion};
 pub use layout::BlendForm;
-pub use plan::{Child, GaussianGeometry, Plan};
+pub use plan::{Division, Plan};
 pub use rasterizer::{PreparedView, Rasterizer, Rendered, ViewCounts};
 pub use shaders::{SHADERS, ShaderSource};
 pub use workspace::Capacities;

@@ -1,60 +1,52 @@
-//! Gaussians as the mapper sees them: their geometry, and a change of their set.
+//! A change of the set of Gaussians.
 
-use glam::{Quat, Vec3};
+use super::layout::DIVIDED_BY_CLONING;
 
-/// One Gaussian without its colour: raw parameters, averaged over its recent steps.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct GaussianGeometry {
-    /// World, metres.
-    pub mean: Vec3,
-    /// Logit of the opacity.
-    pub raw_opacity: f32,
-    /// Natural logarithm of the standard deviations along the Gaussian's own axes, metres.
-    pub log_scale: Vec3,
-    /// World from Gaussian, not necessarily of unit length.
-    pub rotation: Quat,
-}
-
-/// A new Gaussian: its parent with another position, opacity and scale.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Child {
-    /// Index of the parent before the plan is applied.
-    pub parent: u32,
-    /// World, metres.
-    pub mean: Vec3,
-    /// Logit of the opacity.
-    pub raw_opacity: f32,
-    /// Natural logarithm of the standard deviations, metres.
-    pub log_scale: Vec3,
+/// Two Gaussians in place of one, see `shaders/divide.wgsl`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Division {
+    /// Two smaller ones.
+    Split,
+    /// Two of its size.
+    Clone,
 }
 
 /// A change of the set of Gaussians; indices are those before it.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Plan {
-    /// Gaussians that stay, ascending.
-    pub keep: Vec<u32>,
-    /// Gaussians that are appended.
-    pub children: Vec<Child>,
+    /// Gaussians that go, those that are divided included, ascending.
+    pub removed: Vec<u32>,
+    /// Gaussians that are divided; their children come behind all others, in this order, two each.
+    pub divided: Vec<(u32, Division)>,
 }
 
 impl Plan {
     /// A plan that only removes.
-    pub fn keeping(keep: Vec<u32>) -> Self {
-        Self { keep, children: Vec::new() }
+    pub fn removing(removed: Vec<u32>) -> Self {
+        Self { removed, divided: Vec::new() }
     }
 
-    /// Gaussians after the change.
-    pub fn len(&self) -> usize {
-        self.keep.len() + self.children.len()
+    /// Of `before` Gaussians, those that stay.
+    pub fn kept(&self, before: usize) -> usize {
+        before - self.removed.len()
     }
 
-    /// Whether no Gaussian is left.
+    /// Gaussians after the change of `before`.
+    pub fn len_after(&self, before: usize) -> usize {
+        self.kept(before) + 2 * self.divided.len()
+    }
+
+    /// Whether nothing changes.
     pub fn is_empty(&self) -> bool {
-        self.len() == 0
+        self.removed.is_empty() && self.divided.is_empty()
     }
 
-    /// The parent of each child.
-    pub fn parents(&self) -> impl Iterator<Item = u32> + '_ {
-        self.children.iter().map(|child| child.parent)
+    /// The shaders' list: those that go, then the parents.
+    pub(super) fn changes(&self) -> Vec<u32> {
+        let parent = |(parent, division): &(u32, Division)| match division {
+            Division::Split => *parent,
+            Division::Clone => parent | DIVIDED_BY_CLONING,
+        };
+        self.removed.iter().copied().chain(self.divided.iter().map(parent)).collect()
     }
 }

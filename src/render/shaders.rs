@@ -31,6 +31,7 @@ const TILE_SCORES: &str = include_str!("../../shaders/shared/tile_scores.wgsl");
 const TILE_STREAM: &str = include_str!("../../shaders/shared/tile_stream.wgsl");
 const PIXEL_WINDOW: &str = include_str!("../../shaders/shared/pixel_window.wgsl");
 const TARGET: &str = include_str!("../../shaders/shared/target.wgsl");
+const DENSITY: &str = include_str!("../../shaders/shared/density.wgsl");
 const SINK_GRADIENT: &str = include_str!("../../shaders/shared/sink_gradient.wgsl");
 const SINK_ADAM: &str = include_str!("../../shaders/shared/sink_adam.wgsl");
 
@@ -68,5 +69,9 @@ shaders! {
     PROJECT_BACKWARD = "project_backward", "project_backward", [VIEW, COUNTERS, PROJECTION, HARMONICS, SINK_GRADIENT], ["main"];
     PROJECT_BACKWARD_ADAM = "project_backward_adam", "project_backward", [VIEW, COUNTERS, PROJECTION, HARMONICS, SINK_ADAM], ["main"];
     RATES = "rates", "rates", [VIEW], ["copy_memory", "multiply_add"];
+    DENSITY_VERDICTS = "density_verdicts", "density_verdicts", [VIEW, DENSITY], ["main"];
+    DENSITY_HISTORY = "density_history", "density_history", [VIEW, DENSITY], ["main"];
     GATHER = "gather", "gather", [VIEW], ["main"];
+    DIVIDE = "divide", "divide", [VIEW], ["main"];
+    APPEND = "append", "append", [VIEW], ["main"];
 }

@@ -4,6 +4,7 @@
 mod common;
 
 mod against_reference;
+mod density;
 mod embedding;
 mod failures;
 mod long_optimisation;

@@ -3,6 +3,11 @@
 use serde::{Deserialize, Serialize};
 
 use crate::optimise::ErrorPixels;
+use crate::render::layout::DensitySetup;
+use crate::splat::raw_opacity_from_opacity;
+
+/// Views that must have shown a Gaussian before it can be called useless.
+const MIN_VIEWS: f32 = 3.0;
 
 /// How the map's density is controlled after each keyframe.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -15,6 +20,17 @@ pub enum DensityStrategy {
     Classic,
     /// Insertion only.
     None,
+}
+
+/// What the rules need to know of a map.
+#[derive(Clone, Copy, Debug)]
+pub(in crate::mapping) struct MapSize {
+    /// Gaussians in it.
+    pub count: usize,
+    /// Gaussians that it has space for.
+    pub capacity: usize,
+    /// Rounds of density control so far.
+    pub rounds: u32,
 }
 
 /// Densification and pruning.
@@ -119,6 +135,31 @@ impl DensityConfig {
     pub fn error_pixels(&self) -> ErrorPixels {
         let MultiViewConfig { error_ratio, noise, .. } = self.multi_view;
         ErrorPixels { error_ratio, noise }
+    }
+
+    /// The rules for a map, as the GPU has them.
+    pub(in crate::mapping) fn setup(&self, map: &MapSize) -> DensitySetup {
+        let (v, c) = (&self.multi_view, &self.classic);
+        // No Gaussian is old or steep enough for a strategy that does not rule.
+        let rules = |strategy, value| if self.strategy == strategy { value } else { f32::MAX };
+        DensitySetup {
+            count: map.count as u32,
+            capacity: map.capacity as u32,
+            round: map.rounds as f32,
+            min_raw_opacity: raw_opacity_from_opacity(self.min_opacity).max(f32::MIN),
+            max_log_scale: self.max_scale_metres.ln(),
+            min_age: rules(DensityStrategy::MultiView, v.min_age as f32),
+            min_views: MIN_VIEWS,
+            min_weight: v.min_weight,
+            min_contribution: v.min_contribution,
+            faint_raw_opacity: raw_opacity_from_opacity(v.faint_opacity).max(f32::MIN),
+            error_pixels: v.error_pixels,
+            absolute_gradient: v.absolute_gradient,
+            split_log_pixels: v.split_pixels.ln(),
+            gradient: rules(DensityStrategy::Classic, c.gradient),
+            split_or_clone_log_pixels: c.split_pixels.ln(),
+            pad: 0,
+        }
     }
 
     /// A copy without densification.

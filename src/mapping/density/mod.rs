@@ -1,98 +1,73 @@
-//! Density control: which Gaussians go, and which are divided. A strategy only returns a [`Plan`]; one pass applies it, prune before grow.
-
-mod classic;
-mod multi_view;
-
-use glam::Vec3;
-
-pub use self::config::{ClassicConfig, DensityConfig, DensityStrategy, MultiViewConfig};
-
-use super::gaussian_stats::GaussianHistory;
-use crate::optimise::GaussianScore;
-use crate::render::{Child, GaussianGeometry, Plan};
-use crate::splat::{opacity_from_raw, raw_opacity_from_opacity};
+//! Density control: which Gaussians go, and which are divided. The GPU gives a verdict on each (`shaders/density_verdicts.wgsl`); the host
+//! ranks those that compete and makes one plan of it, prune before grow.
+//!
+//! Multi-view-consistent densification and pruning (FastGS, arXiv 2511.04283), per keyframe: a Gaussian is divided where several views
+//! agree on error pixels within it, and pruned where it contributes to no view. Unlike the released code: pruning is decided first and by
+//! order of score, without a draw; an error pixel exceeds a multiple of the mean error, not by the view's extremes; ages are per Gaussian;
+//! faint Gaussians are not divided.
+//!
+//! 3DGS (Kerbl et al. 2023), for comparison: what has a large mean gradient is divided, whatever it costs.
 
 mod config;
 
-/// Input of a density strategy: one Gaussian.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Candidate {
-    pub geometry: GaussianGeometry,
-    pub score: GaussianScore,
-    pub history: GaussianHistory,
-}
+pub(super) use self::config::MapSize;
+pub use self::config::{ClassicConfig, DensityConfig, DensityStrategy, MultiViewConfig};
 
-/// Decision of a density strategy for one Gaussian.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Decision {
-    Keep,
-    Remove,
-    /// Two smaller ones in its place, along its longest axis.
-    Split,
-    /// Two of its size in its place, a little apart.
-    Clone,
-}
+use crate::render::layout::{FAINT, SEEN, VERDICT_BITS, VERDICT_CLONE, VERDICT_REMOVE, VERDICT_SPLIT};
+use crate::render::{Division, Plan};
 
-impl Candidate {
-    /// Its largest standard deviation in the view nearest to it, pixels.
-    pub fn pixels(&self) -> f32 {
-        self.geometry.log_scale.max_element().exp() / self.score.metres_per_pixel.max(1e-9)
-    }
+/// Bits of a verdict without its flags.
+const VERDICT: u32 = VERDICT_BITS & !(SEEN | FAINT);
 
-    pub fn opacity(&self) -> f32 {
-        opacity_from_raw(self.geometry.raw_opacity)
-    }
-
-    fn is_finite(&self) -> bool {
-        let g = &self.geometry;
-        g.mean.is_finite() && g.raw_opacity.is_finite() && g.log_scale.is_finite() && g.rotation.is_finite()
-    }
-}
-
-/// Decides on every Gaussian; those with a NaN are removed whatever the strategy. At most `most` are left, undivided ones first.
-pub(super) fn plan(candidates: &[Candidate], most: usize, config: &DensityConfig) -> Plan {
-    let decisions = match config.strategy {
-        DensityStrategy::MultiView => multi_view::decide(candidates, &config.multi_view),
-        DensityStrategy::Classic => classic::decide(candidates, &config.classic),
-        DensityStrategy::None => vec![Decision::Keep; candidates.len()],
-    };
+/// The change that verdicts on all Gaussians lead to, `[N]`. At most `most` are left, undivided ones first.
+pub(super) fn plan(verdicts: &[u32], most: usize, config: &DensityConfig) -> Plan {
+    let faint_limit = median_score_of_faint(verdicts);
+    let is_removed = |word: u32| word & VERDICT == VERDICT_REMOVE || (word & FAINT != 0 && score(word) > faint_limit);
+    let chosen = chosen(verdicts, config);
+    let mut chosen = chosen.iter().copied().peekable();
+    let mut room = most.saturating_sub(verdicts.len());
     let mut plan = Plan::default();
-    let mut capacity = most.saturating_sub(candidates.len());
-    for (i, (candidate, decision)) in (0..).zip(candidates.iter().zip(decisions)) {
-        let valid = candidate.is_finite()
-            && candidate.opacity() >= config.min_opacity
-            && candidate.geometry.log_scale.max_element() <= config.max_scale_metres.ln();
-        match decision {
-            _ if !valid => {}
-            Decision::Remove => {}
-            Decision::Split | Decision::Clone if capacity > 0 => {
-                plan.children.extend(divide(i, candidate, decision == Decision::Clone));
-                capacity -= 1;
-            }
-            Decision::Keep | Decision::Split | Decision::Clone => plan.keep.push(i),
+    for (i, &word) in (0..).zip(verdicts) {
+        let division = chosen.next_if(|(divided, _)| *divided == i).filter(|_| room > 0);
+        if let Some(division) = division {
+            plan.divided.push(division);
+            room -= 1;
+        }
+        if division.is_some() || is_removed(word) {
+            plan.removed.push(i);
         }
     }
     plan
 }
 
-/// Two in place of one, along its longest axis. Split: narrower ones that look together much as it did (their alphas differ from it by
-/// at most 0.07 of its own along the axis). Clone: two like it, with 1 - √(1 - α) each, so that both together let as much light pass.
-fn divide(parent: u32, of: &Candidate, clone: bool) -> [Child; 2] {
-    let GaussianGeometry { mean, log_scale, rotation, .. } = of.geometry;
-    let scale = log_scale.exp();
-    let longest = scale.max_position();
-    let mut axis = Vec3::ZERO;
-    axis[longest] = scale[longest];
-    let axis = rotation.normalize() * axis;
-    let mut log_scale = log_scale;
-    let (apart, opacity) = if clone {
-        (0.25, 1.0 - (1.0 - of.opacity()).sqrt())
-    } else {
-        log_scale[longest] += 0.7f32.ln();
-        (0.6, 0.85 * of.opacity())
+fn score(word: u32) -> f32 {
+    f32::from_bits(word & !VERDICT_BITS)
+}
+
+/// Those to be divided if there is room, ascending: of those that are too coarse for several views at most a share of the scored ones, those
+/// with most error pixels first.
+fn chosen(verdicts: &[u32], config: &DensityConfig) -> Vec<(u32, Division)> {
+    let division = |word: u32| match word & VERDICT {
+        VERDICT_SPLIT => Some(Division::Split),
+        VERDICT_CLONE => Some(Division::Clone),
+        _ => None,
     };
-    let raw_opacity = raw_opacity_from_opacity(opacity);
-    [-apart, apart].map(|side| Child { parent, mean: mean + side * axis, raw_opacity, log_scale })
+    let mut chosen: Vec<(u32, Division)> = (0..).zip(verdicts).filter_map(|(i, word)| Some((i, division(*word)?))).collect();
+    if config.strategy == DensityStrategy::MultiView {
+        let scored = verdicts.iter().filter(|word| *word & SEEN != 0).count();
+        let of = |(i, _): &(u32, Division)| score(verdicts[*i as usize]);
+        chosen.sort_unstable_by(|a, b| of(b).total_cmp(&of(a)).then(a.0.cmp(&b.0)));
+        chosen.truncate((config.multi_view.max_growth * scored as f32) as usize);
+        chosen.sort_unstable_by_key(|(i, _)| *i);
+    }
+    chosen
+}
+
+/// The score above which a faint Gaussian goes: the median of theirs.
+fn median_score_of_faint(verdicts: &[u32]) -> f32 {
+    let mut scores: Vec<f32> = verdicts.iter().filter(|word| *word & FAINT != 0).map(|word| score(*word)).collect();
+    let middle = scores.len() / 2;
+    if scores.is_empty() { f32::INFINITY } else { *scores.select_nth_unstable_by(middle, f32::total_cmp).1 }
 }
 
 #[cfg(test)]

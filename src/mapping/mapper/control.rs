@@ -1,9 +1,9 @@
 //! Density control: steps that score the Gaussians, and the change that the scores lead to.
 
 use super::{Mapper, Step};
-use crate::mapping::density::{self, Candidate};
+use crate::mapping::density::{self, MapSize};
 use crate::mapping::{DensityConfig, DensityStrategy, MappingError};
-use crate::optimise::{ErrorPixels, GaussianScore, ScoredMap};
+use crate::optimise::ErrorPixels;
 
 impl Mapper {
     /// Whether, and by what, Gaussians are scored: for control of their density, or to know which to give up.
@@ -12,34 +12,35 @@ impl Mapper {
         wanted.then(|| density.error_pixels())
     }
 
-    /// Removes and divides Gaussians by the scores of the steps just taken, if any were scored; returns how many fewer and how many more there
-    /// are for it.
+    /// Removes and divides Gaussians by the verdicts after the steps just taken; without any, by those on the map as it is. Returns how many
+    /// fewer and how many more there are for it.
     pub(super) fn control_density(
         &mut self,
-        scored: Option<ScoredMap>,
+        mut verdicts: Vec<u32>,
         density: &DensityConfig,
     ) -> Result<(usize, usize), MappingError> {
         if self.cloud.is_empty() {
             return Ok((0, 0));
         }
-        let unscored = || -> Result<ScoredMap, MappingError> {
-            let scores = vec![GaussianScore::default(); self.cloud.len()];
-            Ok(ScoredMap { scores, geometry: self.cloud.read_geometry(&self.gpu)? })
-        };
-        let ScoredMap { scores, geometry } = scored.map_or_else(unscored, Ok)?;
-        self.stats.scored(&scores);
-        let histories = self.stats.histories();
-        let candidates: Vec<Candidate> =
-            (0..self.cloud.len()).map(|i| Candidate { geometry: geometry[i], score: scores[i], history: histories[i] }).collect();
-        let mut plan = density::plan(&candidates, self.most_gaussians(), density);
-        if self.probe(plan.len()) {
-            plan = density::plan(&candidates, self.most_gaussians(), density);
+        if verdicts.is_empty() {
+            self.density.prepare(&self.gpu, &density.setup(&self.map_size()))?;
+            verdicts = self.trainer.over_scores(&self.density.verdicts(&self.gpu, &self.cloud))?;
         }
-        let (before, children) = (self.cloud.len(), plan.children.len());
-        self.cloud.apply(&self.gpu, &plan)?;
-        self.stats.apply(&plan);
+        self.density.remember(&self.gpu, &self.cloud, self.trainer.scores());
+        let before = self.cloud.len();
+        let mut plan = density::plan(&verdicts, self.most_gaussians(), density);
+        if self.probe(plan.len_after(before)) {
+            plan = density::plan(&verdicts, self.most_gaussians(), density);
+        }
+        self.change(&plan)?;
         // Two children take their parent's place.
-        Ok((before - plan.keep.len() - children / 2, children / 2))
+        let grown = plan.divided.len();
+        Ok((plan.removed.len() - grown, grown))
+    }
+
+    /// The map's size, as the rules of density control need it.
+    pub(super) fn map_size(&self) -> MapSize {
+        MapSize { count: self.cloud.len(), capacity: self.cloud.capacity(), rounds: self.cloud.rounds() }
     }
 
     /// A step of each of some keyframes of the window, evenly spread over it, that scores the Gaussians.

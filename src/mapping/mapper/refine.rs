@@ -84,7 +84,7 @@ impl Mapper {
         let mut taken = Taken::default();
         while !self.cloud.is_empty() && !stop() {
             let batch = self.draw(self.batch(), false);
-            taken += self.steps(&batch, &config.adam)?;
+            taken += self.steps(&batch, &config.adam, None)?.0;
         }
         Ok(taken)
     }
@@ -143,7 +143,7 @@ impl Mapper {
             let coarse = refinement.progress() < half_size_share;
             let batch = self.draw(BATCH.min(end - refinement.done), coarse);
             adam = refinement.rates();
-            taken += self.steps(&batch, &adam)?;
+            taken += self.steps(&batch, &adam, None)?.0;
             refinement.done += batch.len();
         }
         self.refine_exposures(refinement)?;
@@ -166,9 +166,9 @@ impl Mapper {
         refinement.rounds += 1;
         let steps = self.scoring_steps(&views, density);
         self.trainer.begin_scores(&self.cloud)?;
-        let taken = self.take(&steps, adam, &|| false)?;
+        self.cloud.begin_round();
+        let (taken, verdicts) = self.take_scored(&steps, adam, density)?;
         refinement.done += taken.steps;
-        self.stats.keyframe_mapped();
-        self.control_density(taken.scored, density)
+        self.control_density(verdicts, density)
     }
 }

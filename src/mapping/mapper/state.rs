@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{FinalRefinement, Mapper};
 use crate::gpu::Gpu;
-use crate::mapping::gaussian_stats::GaussianStats;
+use crate::mapping::anchors::Anchors;
 use crate::mapping::keyframe::{KeyframeState, MappedKeyframe};
 use crate::mapping::{Keyframe, MappingConfig, MappingError};
 use crate::optimise::TrainerState;
@@ -19,7 +19,7 @@ use crate::render::{CloudState, GpuCloud};
 pub struct MapperState {
     cloud: CloudState,
     trainer: TrainerState,
-    stats: GaussianStats,
+    anchors: Anchors,
     keyframes: Vec<KeyframeState>,
     rng: u64,
     step_times: Vec<Duration>,
@@ -37,7 +37,7 @@ impl Mapper {
         Ok(MapperState {
             cloud: self.cloud.state(&self.gpu)?,
             trainer: self.trainer.state(),
-            stats: self.stats.clone(),
+            anchors: self.anchors.clone(),
             keyframes: self.keyframes.iter().map(|keyframe| keyframe.state(&self.gpu, &self.images)).collect::<Result<_, _>>()?,
             rng: self.rng.get_seed(),
             step_times: self.step_times.clone(),
@@ -53,11 +53,11 @@ impl Mapper {
     pub fn restore(gpu: Arc<Gpu>, config: &MappingConfig, state: &MapperState) -> Result<Self, MappingError> {
         let mut mapper = Self::new(gpu, config)?;
         mapper.cloud = GpuCloud::restore(&mapper.gpu, config.sh_degree, &state.cloud)?.ok_or(MappingError::State)?;
-        if state.stats.histories().len() != mapper.cloud.len() {
+        if state.anchors.len() != mapper.cloud.len() {
             return Err(MappingError::State);
         }
         mapper.trainer.restore(&state.trainer)?;
-        mapper.stats = state.stats.clone();
+        mapper.anchors = state.anchors.clone();
         mapper.rng = Rng::with_seed(state.rng);
         mapper.step_times = state.step_times.clone();
         mapper.epoch = state.epoch.clone();

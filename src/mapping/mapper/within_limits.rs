@@ -5,7 +5,7 @@ use super::Mapper;
 use crate::gpu::GpuError;
 use crate::mapping::keyframe::MappedKeyframe;
 use crate::mapping::{Keyframe, LimitsConfig, MappingError, insertion, limits};
-use crate::render::{Plan, Rendered};
+use crate::render::{GaussianHistory, Plan, Rendered};
 use crate::splat::Exposure;
 
 impl Mapper {
@@ -46,15 +46,28 @@ impl Mapper {
         if self.probe(self.cloud.len() + new.len()) || limited {
             let most = self.most_gaussians();
             new = new.thinned(limits::insertions_allowed(new.len(), most));
-            let scored_age = self.config.density.every as u32;
-            let keep = limits::largest_contributions(self.stats.histories(), most - new.len(), scored_age);
-            let plan = Plan::keeping(keep);
-            self.cloud.apply(&self.gpu, &plan)?;
-            self.stats.apply(&plan);
+            self.remove_least(self.cloud.len().saturating_sub(most - new.len()))?;
         }
         let left_out = self.cloud.append(&self.gpu, &new)?;
-        self.stats.append(keyframe.id, new.len() - left_out);
+        self.anchors.append(keyframe.id, new.len() - left_out);
         Ok(new.len())
+    }
+
+    /// Removes so many Gaussians of least contribution.
+    fn remove_least(&mut self, excess: usize) -> Result<(), MappingError> {
+        if excess == 0 {
+            return Ok(());
+        }
+        let histories: Vec<GaussianHistory> = self.cloud.histories().read(&self.gpu, 0, self.cloud.len())?;
+        let scored_round = self.cloud.rounds() as f32 - self.config.density.every as f32;
+        self.change(&Plan::removing(limits::least_contributions(&histories, excess, scored_round)))
+    }
+
+    /// Changes the set of Gaussians.
+    pub(super) fn change(&mut self, plan: &Plan) -> Result<(), MappingError> {
+        self.cloud.apply(&self.gpu, plan)?;
+        self.anchors.apply(plan);
+        Ok(())
     }
 
     /// How many Gaussians there may be, at present, when there is to be room for one more keyframe's image.

@@ -2,6 +2,7 @@
 //! (`tests/reference_gradients.rs`), and it checks the GPU (`tests/gpu_against_reference.rs`). Nothing in production imports it; `stress` does, which is a test.
 
 pub mod adam;
+pub mod density;
 pub mod loss;
 pub mod project_backward;
 pub mod project_forward;
