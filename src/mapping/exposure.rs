@@ -1,14 +1,12 @@
-//! A keyframe's exposure against the map's, which began as that of the first keyframe, and the image as it would be in the map's.
+//! A keyframe's exposure against the map's, which began as that of the first keyframe.
 //!
 //! It is measured when the keyframe arrives, on the render that insertion needs as well: the median ratio of image and render over the
 //! pixels that both show well, in each channel. Photos arrive before there is a map, so the final refinement measures them. The loss
 //! compares the map with corrected images.
 
-use image::{Rgb, RgbImage};
 use serde::{Deserialize, Serialize};
 
-use crate::optimise::Pixels;
-use crate::render::Rendered;
+use crate::optimise::{Pixels, SampledPixel};
 use crate::sequence::RectifiedImage;
 use crate::splat::Exposure;
 
@@ -51,27 +49,23 @@ impl ExposureConfig {
 
 /// Pixels that the map covers less than this say nothing.
 const MIN_ALPHA: f32 = 0.95;
-/// Pixels of an image that are compared: their median varies by a few thousandths of their spread.
-const MAX_SAMPLES: usize = 1 << 17;
 /// Nor do those that are nearly black or nearly saturated in the image or the render.
 const WELL_EXPOSED: std::ops::Range<f32> = 0.08..0.92;
 
-/// The exposure of an image of which the map shows `rendered`; `last` is that of the keyframe before. `recorded` has the image's pixels, 0 to
+/// The exposure of an image of which the map shows `samples`; `last` is that of the keyframe before. `recorded` has the image's pixels, 0 to
 /// 255, and `None` where the camera recorded nothing.
 pub(super) fn measure(
     recorded: impl Fn(usize) -> Option<[u8; 3]>,
-    rendered: &Rendered,
+    samples: &[SampledPixel],
     last: &Exposure,
     config: &ExposureConfig,
 ) -> Exposure {
-    let stride = rendered.color_depth.len().div_ceil(MAX_SAMPLES).max(1);
-    let pixels = || (0..rendered.color_depth.len()).step_by(stride);
-    let covered = pixels().filter(|&i| rendered.alpha(i) >= MIN_ALPHA);
-    let covered: Vec<(usize, [u8; 3])> = covered.filter_map(|i| Some((i, recorded(i)?))).collect();
+    let covered = samples.iter().filter(|sample| sample.alpha >= MIN_ALPHA);
+    let covered: Vec<(&SampledPixel, [u8; 3])> = covered.filter_map(|sample| Some((sample, recorded(sample.pixel)?))).collect();
     let channel = |k: usize| {
-        let ratio = |&(i, pixel): &(usize, [u8; 3])| {
+        let ratio = |&(sample, pixel): &(&SampledPixel, [u8; 3])| {
             let recorded = f32::from(pixel[k]) / 255.0;
-            let shown = rendered.color_depth[i][k];
+            let shown = sample.color[k];
             (WELL_EXPOSED.contains(&recorded) && WELL_EXPOSED.contains(&shown)).then(|| recorded / shown)
         };
         let mut ratios: Vec<f32> = covered.iter().filter_map(ratio).collect();
@@ -80,7 +74,7 @@ pub(super) fn measure(
             return last.0[k];
         }
         let (_, median, _) = ratios.select_nth_unstable_by(count / 2, f32::total_cmp);
-        let trust = count as f32 / (count as f32 + config.prior_share * pixels().len() as f32);
+        let trust = count as f32 / (count as f32 + config.prior_share * samples.len() as f32);
         let change = median.ln() - last.0[k];
         let found = if change.abs() <= config.max_change { last.0[k] + trust * change } else { last.0[k] };
         (1.0 - config.pull) * found
@@ -108,34 +102,24 @@ pub(super) fn center(exposures: &mut [Exposure]) {
     exposures.iter_mut().for_each(|exposure| (0..3).for_each(|k| exposure.0[k] -= mean[k]));
 }
 
-/// The image as the map's exposure would have it.
-pub(super) fn corrected(image: &RgbImage, exposure: &Exposure) -> RgbImage {
-    let gains = exposure.gains();
-    let table = |k: usize| -> [u8; 256] { std::array::from_fn(|value| (value as f32 / gains[k]).round().min(255.0) as u8) };
-    let tables = [table(0), table(1), table(2)];
-    let mut corrected = image.clone();
-    corrected.pixels_mut().for_each(|Rgb(pixel)| *pixel = std::array::from_fn(|k| tables[k][usize::from(pixel[k])]));
-    corrected
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::geometry::Pinhole;
+    use image::{Rgb, RgbImage};
 
     /// A picture of some colours, and a render of it by a map of another exposure, half of which is missing.
-    fn pair(gains: [f32; 3]) -> (RectifiedImage, Rendered) {
+    fn pair(gains: [f32; 3]) -> (RectifiedImage, Vec<SampledPixel>) {
         let shown = |x: u32, y: u32, k: usize| 0.2 + 0.5 * (((x * 7 + y * 13 + k as u32 * 5) % 32) as f32 / 32.0);
         let color =
             RgbImage::from_fn(32, 24, |x, y| Rgb(std::array::from_fn(|k| (shown(x, y, k) * gains[k] * 255.0).round() as u8)));
         let pinhole = Pinhole { fx: 30.0, fy: 30.0, cx: 15.5, cy: 11.5, width: 32, height: 24 };
-        let pixels = || (0..32 * 24u32).map(|i| (i % 32, i / 32));
-        let rendered = Rendered {
-            width: 32,
-            height: 24,
-            color_depth: pixels().map(|(x, y)| [shown(x, y, 0), shown(x, y, 1), shown(x, y, 2), 1.0]).collect(),
-            transmittance: pixels().map(|(x, _)| if x < 16 { 0.0 } else { 0.9 }).collect(),
+        let sample = |i: u32| SampledPixel {
+            pixel: i as usize,
+            color: [0, 1, 2].map(|k| shown(i % 32, i / 32, k)),
+            alpha: if i % 32 < 16 { 1.0 } else { 0.1 },
         };
+        let rendered = (0..32 * 24).map(sample).collect();
         (RectifiedImage { pinhole, color, depth: None, valid: None }, rendered)
     }
 
@@ -146,11 +130,6 @@ mod tests {
         let config = ExposureConfig { prior_share: 1e-6, pull: 0.0, ..ExposureConfig::default() };
         let exposure = measure(recorded(&image), &rendered, &Exposure::default(), &config);
         assert!((exposure.gains() - glam::Vec3::from(gains)).abs().max_element() < 0.01, "{exposure:?}");
-        let corrected = corrected(&image.color, &exposure);
-        let off = |(i, p): (usize, &Rgb<u8>)| {
-            (0..3).map(|k| (f32::from(p.0[k]) - 255.0 * rendered.color_depth[i][k]).abs()).fold(0.0, f32::max)
-        };
-        assert!(corrected.pixels().enumerate().map(off).fold(0.0, f32::max) < 2.5);
     }
 
     #[test]
@@ -170,11 +149,10 @@ mod tests {
         let config = ExposureConfig { pull: 0.0, ..ExposureConfig::default() };
         let last = Exposure([0.1; 3]);
         let whole = measure(recorded(&image), &rendered, &last, &config);
-        let only = |i: usize| i.is_multiple_of(32);
-        (0..rendered.transmittance.len()).filter(|&i| !only(i)).for_each(|i| rendered.transmittance[i] = 1.0);
+        rendered.iter_mut().filter(|sample| !sample.pixel.is_multiple_of(32)).for_each(|sample| sample.alpha = 0.0);
         let little = measure(recorded(&image), &rendered, &last, &config);
         assert!((0..3).all(|k| last.0[k] < little.0[k] && little.0[k] < whole.0[k]), "{little:?} {whole:?}");
-        rendered.transmittance.fill(1.0);
+        rendered.iter_mut().for_each(|sample| sample.alpha = 0.0);
         assert_eq!(measure(recorded(&image), &rendered, &last, &config), last);
         let (dark, rendered) = pair([0.45; 3]);
         assert_eq!(measure(recorded(&dark), &rendered, &last, &config), last);

@@ -13,7 +13,7 @@ use super::plane_sweep::{self, SourceView};
 use super::{KeyframeId, MappingError, PoseUpdate};
 use crate::geometry::{Pinhole, Se3, Sim3};
 use crate::gpu::{Gpu, GpuError, plain};
-use crate::optimise::{Pixels, TrainingView};
+use crate::optimise::{Pixels, TargetImage, TrainingView};
 use crate::sequence::{DepthImage, RectifiedImage};
 use crate::splat::{Exposure, ViewCamera};
 use images::{Images, halved_pinhole};
@@ -111,15 +111,15 @@ struct Swept {
 }
 
 impl MappedKeyframe {
-    /// Uploads the images, see [`Images::new`], as they were recorded.
-    pub fn new(gpu: &Gpu, keyframe: &Keyframe, exposure: Exposure, with_half: bool) -> Result<Self, GpuError> {
+    /// Uploads the images, see [`Images::new`], as they were recorded. Its exposure is still to be measured.
+    pub fn new(gpu: &Gpu, keyframe: &Keyframe, with_half: bool) -> Result<Self, GpuError> {
         let (image, camera) = (&keyframe.image, keyframe.camera());
         Ok(Self {
             id: keyframe.id,
             camera,
             anchored_from_world: camera.camera_from_world,
             scale_since_anchor: 1.0,
-            exposure,
+            exposure: Exposure::default(),
             image: Images::new(gpu, image, with_half)?,
             gray: matches!(keyframe.depth_source, DepthSource::Landmarks { .. }).then(|| plane_sweep::gray(&image.color)),
             covisible: keyframe.covisible.clone(),
@@ -241,6 +241,11 @@ impl MappedKeyframe {
             (true, None) => pixels * 8,
             (true, Some(_)) => pixels * 10,
         }
+    }
+
+    /// Its image at full size.
+    pub fn target(&self) -> &TargetImage {
+        &self.image.whole
     }
 
     /// Training view; the smaller image if `coarse` and there is one. An offloaded image is still to be streamed.

@@ -21,13 +21,16 @@ pub use state::MapperState;
 use super::anchors::Anchors;
 use super::host_time::HostTimes;
 use super::image_store::ImageStore;
+use super::insertion::Offer;
 use super::keyframe::{DepthSource, MappedKeyframe};
 use super::plane_sweep::{self, SourceView};
 use super::schedule::{self, Step};
-use super::{DensityConfig, Keyframe, KeyframeId, MappingConfig, MappingError, PoseUpdate, exposure, initialise_from_points};
+use super::{
+    DensityConfig, InsertionConfig, Keyframe, KeyframeId, MappingConfig, MappingError, PoseUpdate, initialise_from_points,
+};
 use crate::geometry::Se3;
 use crate::gpu::Gpu;
-use crate::optimise::{AdamConfig, DensityPasses, OverScores, Trainer, TrainingView};
+use crate::optimise::{AdamConfig, DensityPasses, OverScores, Survey, SurveyRules, Trainer, TrainingView};
 use crate::render::{GpuCloud, Rendered};
 use crate::sequence::{KnownPoint, RectifiedImage};
 use crate::splat::{Exposure, GaussianCloud, ViewCamera};
@@ -115,20 +118,22 @@ impl Mapper {
         if keyframe.image.depth.is_none() && self.has_not_begun() {
             return Ok(KeyframeReport { id: keyframe.id, ..KeyframeReport::default() });
         }
-        let mut keyframe = self.timed("depth", |mapper| mapper.sweep(keyframe)).map_or(Cow::Borrowed(keyframe), Cow::Owned);
-        let is_compared = keyframe.image.depth.is_some() || (self.config.exposure.enabled && self.is_trained());
-        let is_compared = is_compared && !self.cloud.is_empty();
-        let rendered = is_compared.then(|| self.timed("render", |mapper| mapper.render(&keyframe.camera()))).transpose()?;
-        let exposure = self.timed("exposure", |mapper| mapper.exposure(&keyframe.image, rendered.as_ref()));
+        let keyframe = self.timed("depth", |mapper| mapper.sweep(keyframe)).map_or(Cow::Borrowed(keyframe), Cow::Owned);
         // Before its insertion: a bound on memory leaves to it what the image has left.
-        let mapped = self.timed("image", |mapper| mapper.upload(&keyframe, exposure))?;
+        let mut mapped = self.timed("image", |mapper| mapper.upload(&keyframe))?;
+        let config = self.config.clone();
+        let (offer, survey) = std::thread::scope(|scope| {
+            let offer = scope.spawn(|| Offer::new(&keyframe.image, &config.insertion));
+            let survey = self.timed("survey", |mapper| mapper.survey(&mapped, keyframe.image.depth.is_some()));
+            (offer.join().expect("the offer is made"), survey)
+        });
+        let survey = survey?;
+        let exposure = self.timed("exposure", |mapper| mapper.exposure(&keyframe.image, survey.as_ref()));
+        mapped.exposure = exposure;
         self.keyframes.push(mapped);
-        if exposure != Exposure::default() {
-            let corrected = self.timed("image", |_| exposure::corrected(&keyframe.image.color, &exposure));
-            keyframe.to_mut().image.color = corrected;
-        }
         self.limit_gpu_images()?;
-        let inserted = self.timed("insertion", |mapper| mapper.insert_gaussians(&keyframe, rendered.as_ref()))?;
+        let insert = |mapper: &mut Self, offer| mapper.insert_gaussians(&keyframe, &offer, (survey.as_ref(), &exposure));
+        let inserted = offer.map_or(Ok(0), |offer| self.timed("insertion", |mapper| insert(mapper, offer)))?;
         let first = self.keyframes.len() == 1;
         let iterations = if first { self.config.first_iterations } else { self.config.iterations_per_keyframe };
         if iterations == 0 {
@@ -223,6 +228,17 @@ impl Mapper {
     /// Number of Gaussians in the map.
     pub fn gaussians(&self) -> usize {
         self.cloud.len()
+    }
+
+    /// The map seen from a keyframe, if it is compared with it: by its depth or to find its exposure.
+    fn survey(&mut self, keyframe: &MappedKeyframe, has_depth: bool) -> Result<Option<Survey>, MappingError> {
+        let is_compared = has_depth || (self.config.exposure.enabled && self.is_trained());
+        if !is_compared || self.cloud.is_empty() {
+            return Ok(None);
+        }
+        let InsertionConfig { stride, min_alpha, depth_disagreement, .. } = self.config.insertion;
+        let rules = SurveyRules { target: keyframe.target(), cell: stride, min_alpha, depth_disagreement };
+        Ok(Some(self.trainer.survey(&self.cloud, &keyframe.camera, has_depth.then_some(&rules))?))
     }
 
     /// The keyframe with more depth than that of its landmarks, if that is what it has and more can be found.

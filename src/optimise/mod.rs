@@ -6,10 +6,12 @@ mod image_buffers;
 mod kernels;
 mod loss;
 mod scores;
+mod survey;
 mod trainer;
 
 pub use adam::AdamConfig;
 pub use density::{DensityPasses, Verdicts};
 pub use loss::{LossConfig, LossTerms, Pixels, TargetImage, ssim_phase};
 pub use scores::{ErrorPixels, GaussianScore, OverScores};
+pub use survey::{SampledPixel, Survey, SurveyRules, SurveyedCell};
 pub use trainer::{Gradients, ImageGradients, StepReport, Trainer, TrainerState, TrainingView};

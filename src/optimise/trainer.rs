@@ -13,6 +13,7 @@ pub use state::TrainerState;
 use super::image_buffers::{self, ImageBuffers};
 use super::kernels::Kernels;
 use super::scores::{ErrorPixels, GaussianScore, OverScores, ScoredImage, Scores};
+use super::survey::SurveyPass;
 use super::{AdamConfig, LossConfig, LossTerms, Pixels, TargetImage};
 use crate::gpu::{Gpu, GpuBuffer, GpuError};
 use crate::render::layout::StepLog;
@@ -70,9 +71,10 @@ enum Sink<'a> {
 /// The training step: the rasterizer, the passes that follow it, and all their scratch buffers.
 #[derive(Debug)]
 pub struct Trainer {
-    rasterizer: Rasterizer,
+    pub(super) rasterizer: Rasterizer,
     kernels: Kernels,
     scores: Scores,
+    pub(super) survey: SurveyPass,
     /// Steps submitted so far, and the host's time to encode and submit them.
     steps: usize,
     encode_time: Duration,
@@ -115,6 +117,7 @@ impl Trainer {
         Ok(Self {
             kernels,
             scores: Scores::new(&rasterizer)?,
+            survey: SurveyPass::new(gpu)?,
             steps: 0,
             encode_time: Duration::ZERO,
             images: Vec::new(),

@@ -29,6 +29,14 @@ pub const INTERSECTION_COUNTER: u32 = 1;
 /// Number of counters.
 pub const COUNTERS: u32 = 2;
 
+/// Brightness of a surveyed cell in steps: 14 bits for 0 to 2.
+pub const BRIGHTNESS_STEP: f32 = 2.0 / BRIGHTNESS_MASK as f32;
+/// See [`BRIGHTNESS_STEP`].
+pub const BRIGHTNESS_MASK: u32 = (1 << 14) - 1;
+/// Bit of a surveyed cell: the map lacks what its first pixel shows.
+pub const LACKS_CORNER: u32 = 1 << 14;
+/// The same of the pixel in its middle.
+pub const LACKS_CENTER: u32 = 1 << 15;
 /// Verdict of density control on a Gaussian: it stays as it is.
 pub const VERDICT_KEEP: u32 = 0;
 /// It goes.
@@ -142,6 +150,7 @@ pub fn wgsl_constants(form: BlendForm) -> String {
         ("FAR_METRES", FAR_METRES),
         ("DILATION", DILATION),
         ("MIN_DETERMINANT", MIN_DETERMINANT),
+        ("BRIGHTNESS_STEP", f64::from(BRIGHTNESS_STEP)),
         ("MIN_QUATERNION_NORM_SQUARED", MIN_QUATERNION_NORM_SQUARED),
     ];
     let integers = [
@@ -157,6 +166,9 @@ pub fn wgsl_constants(form: BlendForm) -> String {
         ("SLOT_CHUNK", form.slot_chunk()),
         ("VISIBLE_COUNTER", VISIBLE_COUNTER),
         ("INTERSECTION_COUNTER", INTERSECTION_COUNTER),
+        ("BRIGHTNESS_MASK", BRIGHTNESS_MASK),
+        ("LACKS_CORNER", LACKS_CORNER),
+        ("LACKS_CENTER", LACKS_CENTER),
         ("VERDICT_KEEP", VERDICT_KEEP),
         ("VERDICT_REMOVE", VERDICT_REMOVE),
         ("VERDICT_SPLIT", VERDICT_SPLIT),

@@ -69,6 +69,7 @@ shaders! {
     PROJECT_BACKWARD = "project_backward", "project_backward", [VIEW, COUNTERS, PROJECTION, HARMONICS, SINK_GRADIENT], ["main"];
     PROJECT_BACKWARD_ADAM = "project_backward_adam", "project_backward", [VIEW, COUNTERS, PROJECTION, HARMONICS, SINK_ADAM], ["main"];
     RATES = "rates", "rates", [VIEW], ["copy_memory", "multiply_add"];
+    SURVEY = "survey", "survey", [VIEW], ["main"];
     DENSITY_VERDICTS = "density_verdicts", "density_verdicts", [VIEW, DENSITY], ["main"];
     DENSITY_HISTORY = "density_history", "density_history", [VIEW, DENSITY], ["main"];
     GATHER = "gather", "gather", [VIEW], ["main"];

@@ -16,4 +16,5 @@ mod reference_gradients;
 mod scores;
 mod shaders;
 mod stress;
+mod survey;
 mod traffic;

@@ -2,7 +2,7 @@
 
 use super::{FinalRefinement, Mapper};
 use crate::mapping::{ExposureConfig, KeyframeId, MappingError, exposure};
-use crate::render::Rendered;
+use crate::optimise::Survey;
 use crate::sequence::RectifiedImage;
 use crate::splat::Exposure;
 
@@ -12,11 +12,11 @@ impl Mapper {
         self.keyframes.iter().map(|keyframe| (keyframe.id, keyframe.exposure))
     }
 
-    /// The exposure of an image of which the map shows `rendered`. A map that no step has moved yet shows nothing that counts.
-    pub(super) fn exposure(&self, image: &RectifiedImage, rendered: Option<&Rendered>) -> Exposure {
+    /// The exposure of an image of which the map shows what was surveyed. A map that no step has moved yet shows nothing that counts.
+    pub(super) fn exposure(&self, image: &RectifiedImage, survey: Option<&Survey>) -> Exposure {
         let (config, last) = (&self.config.exposure, self.keyframes.last().map_or(Exposure::default(), |k| k.exposure));
-        let shown = rendered.filter(|_| config.enabled && self.is_trained());
-        shown.map_or(last, |rendered| exposure::measure(exposure::recorded(image), rendered, &last, config))
+        let shown = survey.filter(|_| config.enabled && self.is_trained());
+        shown.map_or(last, |shown| exposure::measure(exposure::recorded(image), &shown.samples, &last, config))
     }
 
     /// Measures all exposures if that is due: so many times in the first half of a refinement, at equal distances.
@@ -32,10 +32,10 @@ impl Mapper {
         let mut measured = Vec::with_capacity(self.keyframes.len());
         for k in 0..self.keyframes.len() {
             let camera = self.keyframes[k].camera;
-            let rendered = self.render(&camera)?;
+            let survey = self.trainer.survey(&self.cloud, &camera, None)?;
             let keyframe = &self.keyframes[k];
             let pixels = keyframe.pixels(&self.gpu, &self.images)?;
-            measured.push(exposure::measure(exposure::recorded_pixels(&pixels), &rendered, &keyframe.exposure, &config));
+            measured.push(exposure::measure(exposure::recorded_pixels(&pixels), &survey.samples, &keyframe.exposure, &config));
         }
         exposure::center(&mut measured);
         self.keyframes.iter_mut().zip(measured).for_each(|(keyframe, exposure)| keyframe.exposure = exposure);

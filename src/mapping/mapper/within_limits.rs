@@ -3,16 +3,18 @@
 
 use super::Mapper;
 use crate::gpu::GpuError;
+use crate::mapping::insertion::{self, Offer};
 use crate::mapping::keyframe::MappedKeyframe;
-use crate::mapping::{Keyframe, LimitsConfig, MappingError, insertion, limits};
-use crate::render::{GaussianHistory, Plan, Rendered};
+use crate::mapping::{Keyframe, LimitsConfig, MappingError, limits};
+use crate::optimise::Survey;
+use crate::render::{GaussianHistory, Plan};
 use crate::splat::Exposure;
 
 impl Mapper {
     /// The keyframe with its image on the GPU. Where there is no memory for it, images of earlier ones leave the GPU.
-    pub(super) fn upload(&mut self, keyframe: &Keyframe, exposure: Exposure) -> Result<MappedKeyframe, MappingError> {
+    pub(super) fn upload(&mut self, keyframe: &Keyframe) -> Result<MappedKeyframe, MappingError> {
         loop {
-            let uploaded = MappedKeyframe::new(&self.gpu, keyframe, exposure, self.config.learns_at_half_size());
+            let uploaded = MappedKeyframe::new(&self.gpu, keyframe, self.config.learns_at_half_size());
             let full = matches!(uploaded, Err(GpuError::OutOfMemory(_)));
             match limits::least_needed_keyframe(&self.keyframes, self.config.window.recent).filter(|_| full) {
                 Some(k) => self.keyframes[k].offload(&self.gpu, &mut self.images)?,
@@ -34,11 +36,14 @@ impl Mapper {
         Ok(())
     }
 
-    pub(super) fn insert_gaussians(&mut self, keyframe: &Keyframe, rendered: Option<&Rendered>) -> Result<usize, MappingError> {
-        if keyframe.image.depth.is_none() {
-            return Ok(0);
-        }
-        let mut new = insertion::gaussians(keyframe, rendered, &self.config.insertion, self.config.sh_degree);
+    /// Inserts of what a keyframe offers what the map lacks as it was surveyed; returns how many Gaussians.
+    pub(super) fn insert_gaussians(
+        &mut self,
+        keyframe: &Keyframe,
+        offer: &Offer,
+        shown: (Option<&Survey>, &Exposure),
+    ) -> Result<usize, MappingError> {
+        let mut new = insertion::gaussians(keyframe, offer, shown, &self.config.insertion, self.config.sh_degree);
         let limited = self.config.limits.limits_gaussians();
         if limited {
             self.cloud.limit(self.most_gaussians());

@@ -101,6 +101,29 @@ host_twins! {
         /// Unused.
         pad: [u32; 3],
     }
+    /// A survey of a render (`shaders/survey.wgsl`).
+    SurveySetup {
+        /// Image width, pixels.
+        width: u32,
+        /// Image height, pixels.
+        height: u32,
+        /// Side of a cell, pixels.
+        cell: u32,
+        /// Cells in a row.
+        columns: u32,
+        /// Cells in all.
+        cells: u32,
+        /// Pixels from one sample to the next.
+        sample_stride: u32,
+        /// Sampled pixels.
+        samples: u32,
+        /// Alpha below which a pixel lacks map.
+        min_alpha: f32,
+        /// Share of its depth by which a pixel is nearer than the map and lacks it.
+        depth_disagreement: f32,
+        /// Unused.
+        pad: [u32; 3],
+    }
     /// A change of the set of Gaussians (`shaders/gather.wgsl`).
     GatherSetup {
         /// Gaussians that stay.
