@@ -97,6 +97,16 @@ impl GpuBuffer {
         }
     }
 
+    /// Writes the first of `words` without a copy of them on the host; it takes effect before the next submission.
+    pub fn write_words(&self, gpu: &Gpu, words: impl ExactSizeIterator<Item = u32>) {
+        let Some(bytes) = std::num::NonZeroU64::new(words.len() as u64 * 4) else { return };
+        let Some(mut view) = gpu.queue.write_buffer_with(&self.raw, self.offset, bytes) else { return };
+        for (to, word) in view.slice(..).into_chunks::<4>().0.into_iter().zip(words) {
+            to.write(word.to_ne_bytes());
+        }
+        gpu.traffic.uploaded();
+    }
+
     /// Elements `first` to before `first + count`, to be read with others by [`Gpu::read`].
     pub fn part<T: Pod>(&self, first: usize, count: usize) -> Part<'_> {
         let element = std::mem::size_of::<T>() as u64;

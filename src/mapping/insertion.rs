@@ -78,7 +78,7 @@ pub(super) fn gaussians(
 
 /// Whether the map lacks what the pixel at the center of a block shows.
 fn lacks(survey: &Survey, block: Block, (x, y): (u32, u32), cell: u32) -> bool {
-    let SurveyedCell { lacks_corner, lacks_center, .. } = survey.cells[(y / cell * survey.columns + x / cell) as usize];
+    let SurveyedCell { lacks_corner, lacks_center, .. } = survey.cell((y / cell * survey.columns + x / cell) as usize);
     if block.size == cell { lacks_center } else { lacks_corner }
 }
 
@@ -213,7 +213,7 @@ mod tests {
 
     /// Cells of two pixels over an image of 32×24.
     fn survey(cell: impl Fn(u32) -> SurveyedCell) -> Survey {
-        Survey { columns: 16, cells: (0..16 * 12).map(|i| cell(2 * (i % 16))).collect(), samples: Vec::new() }
+        Survey::of_cells(16, &(0..16 * 12).map(|i| cell(2 * (i % 16))).collect::<Vec<_>>())
     }
 
     #[test]

@@ -140,16 +140,16 @@ impl TargetImage {
     pub fn masked(gpu: &Gpu, image: &RgbImage, depth_metres: Option<&[f32]>, valid: Option<&[bool]>) -> Result<Self, GpuError> {
         let (width, height) = image.dimensions();
         let pixels = GpuPixels::blank(gpu, (width, height))?;
-        let mut packed: Vec<u32> = image.pixels().map(|p| u32::from_le_bytes([p.0[0], p.0[1], p.0[2], 255])).collect();
-        if let Some(valid) = valid {
-            assert_eq!(valid.len(), packed.len(), "the mask has the size of the image");
-            packed.iter_mut().zip(valid).filter(|(_, valid)| !**valid).for_each(|(pixel, _)| *pixel = 0);
-        }
-        pixels.color.write(gpu, 0, &packed);
+        let count = (width * height) as usize;
+        assert!(valid.is_none_or(|valid| valid.len() == count), "the mask has the size of the image");
+        let is_valid = |i: usize| valid.is_none_or(|valid| valid[i]);
+        let colors = image.as_raw().chunks_exact(3).enumerate();
+        let packed = colors.map(|(i, c)| if is_valid(i) { u32::from_le_bytes([c[0], c[1], c[2], 255]) } else { 0 });
+        pixels.color.write_words(gpu, packed);
         if let Some(metres) = depth_metres {
-            assert_eq!(metres.len(), packed.len(), "depth has the size of the image");
-            let measured: Vec<f32> = metres.iter().zip(&packed).map(|(m, color)| if *color == 0 { 0.0 } else { *m }).collect();
-            pixels.depth.write(gpu, 0, &measured);
+            assert_eq!(metres.len(), count, "depth has the size of the image");
+            let measured = metres.iter().enumerate().map(|(i, metres)| if is_valid(i) { metres.to_bits() } else { 0 });
+            pixels.depth.write_words(gpu, measured);
         }
         Ok(Self { width, height, pixels: Some(pixels) })
     }

@@ -51,8 +51,8 @@ pub struct SurveyedCell {
 pub struct Survey {
     /// Cells in a row.
     pub columns: u32,
-    /// Row by row; none without rules.
-    pub cells: Vec<SurveyedCell>,
+    /// Of the cells row by row, two of `shaders/survey.wgsl` each; none without rules.
+    words: Vec<u32>,
     /// Spread evenly over the image.
     pub samples: Vec<SampledPixel>,
 }
@@ -131,6 +131,19 @@ fn spread(stride: u32, width: u32) -> u32 {
     (stride..).find(|&stride| stride == 1 || !has_common_divisor(stride)).unwrap_or(stride)
 }
 
+impl Survey {
+    /// Of so many cells in a row, for whoever has them otherwise; without samples.
+    pub fn of_cells(columns: u32, cells: &[SurveyedCell]) -> Self {
+        let words = cells.chunks(2).map(|pair| pair.iter().rev().fold(0, |word, cell| word << 16 | cell.bits()));
+        Self { columns, words: words.collect(), samples: Vec::new() }
+    }
+
+    /// The cell at a place in the order of rows.
+    pub fn cell(&self, i: usize) -> SurveyedCell {
+        SurveyedCell::from_bits(self.words[i / 2] >> (16 * (i % 2)))
+    }
+}
+
 impl SurveyedCell {
     fn from_bits(bits: u32) -> Self {
         Self {
@@ -138,6 +151,12 @@ impl SurveyedCell {
             lacks_corner: bits & LACKS_CORNER != 0,
             lacks_center: bits & LACKS_CENTER != 0,
         }
+    }
+
+    fn bits(&self) -> u32 {
+        let brightness = ((self.brightness / BRIGHTNESS_STEP).round() as u32).min(BRIGHTNESS_MASK);
+        let flag = |is_set: bool, bit: u32| if is_set { bit } else { 0 };
+        brightness | flag(self.lacks_corner, LACKS_CORNER) | flag(self.lacks_center, LACKS_CENTER)
     }
 }
 
@@ -173,17 +192,12 @@ impl Trainer {
                 self.rasterizer.reserve_for(&counters)?;
                 continue;
             }
-            let cells = words.iter().flat_map(|word| [word & 0xffff, word >> 16]).take(setup.cells as usize);
             let shares = |word: u32| [word & 0xffff, word >> 16].map(|steps| steps as f32 / f32::from(u16::MAX));
             let sample = |(i, [first, second]): (usize, [u32; 2])| {
                 let ([red, green], [blue, alpha]) = (shares(first), shares(second));
                 SampledPixel { pixel: i * setup.sample_stride as usize, color: [red, green, blue], alpha }
             };
-            return Ok(Survey {
-                columns: setup.columns,
-                cells: cells.map(SurveyedCell::from_bits).collect(),
-                samples: samples.into_iter().enumerate().map(sample).collect(),
-            });
+            return Ok(Survey { columns: setup.columns, words, samples: samples.into_iter().enumerate().map(sample).collect() });
         }
     }
 }

@@ -51,6 +51,12 @@ fn a_keyframe_takes_three_waits() {
     let each: Vec<TrafficCount> =
         (0..6).map(|id| of(&gpu, || mapper.insert(&keyframe(id, true), &|| false).unwrap()).0).collect();
     assert!(each[1..].iter().all(|traffic| traffic.waits <= 3), "{each:?}");
+    // A word for each Gaussian, 16 bits for each cell, 8 bytes for each sample, and the logs of the steps.
+    let image = keyframe(0, true).image;
+    let (pixels, cells) =
+        (image.color.width() * image.color.height(), image.color.width().div_ceil(2) * image.color.height().div_ceil(2));
+    let most = |gaussians: usize| 4 * gaussians as u64 + u64::from(2 * cells + 8 * pixels.min(1 << 14)) + 32 * 256;
+    assert!(each[1..].iter().all(|traffic| traffic.bytes_read <= most(mapper.gaussians())), "{each:?}");
     // A keyframe's own uploads, and those of its Gaussians: none follows from the number of steps.
     let uploads = |steps_per_keyframe: usize| {
         let mut config = MappingConfig::default();

@@ -3,7 +3,7 @@
 use image::RgbImage;
 
 use crate::mapping::InsertionConfig;
-use crate::optimise::{Survey, SurveyedCell};
+use crate::optimise::Survey;
 use crate::splat::Exposure;
 
 /// A square of pixels that gets one Gaussian.
@@ -119,12 +119,12 @@ impl Missed {
         let factors = exposure.gains().to_array().map(|gain| 1.0 / (3.0 * 255.0 * f64::from(gain)));
         let rows = size.1.div_ceil(cell);
         let places = (0..rows).flat_map(|row| (0..survey.columns).map(move |column| (column * cell, row * cell)));
-        let missed = |((x, y), shown): ((u32, u32), &SurveyedCell)| {
+        let missed = |(i, (x, y)): (usize, (u32, u32))| {
             let (sums, pixels) = colors.sums((x, y), (x + cell, y + cell));
             let recorded: f64 = (0..3).map(|k| f64::from(sums[k]) * factors[k]).sum();
-            [recorded - f64::from(shown.brightness) * pixels]
+            [recorded - f64::from(survey.cell(i).brightness) * pixels]
         };
-        let values = places.zip(&survey.cells).map(missed);
+        let values = places.enumerate().map(missed);
         Self { sums: Sums::new((survey.columns, rows), values, |a, b| a + b), cell, size }
     }
 
@@ -146,6 +146,7 @@ mod tests {
     use image::Rgb;
 
     use super::*;
+    use crate::optimise::SurveyedCell;
 
     #[test]
     fn blocks_cover_each_pixel_once_and_shrink_towards_an_edge() {
@@ -172,12 +173,12 @@ mod tests {
         let exposure = Exposure([1.25f32.ln(); 3]);
         let brightness = 90.0 / 255.0 / 1.25;
         let cells = vec![SurveyedCell { brightness, ..SurveyedCell::default() }; 17 * 13];
-        let survey = Survey { columns: 17, cells, samples: Vec::new() };
+        let survey = Survey::of_cells(17, &cells);
         let missed = Missed::new(&ColorSums::new(&image), &survey, &exposure, 2);
         let response = |x, y, size| missed.response(Block { x, y, size });
         let expected = 110.0 / 255.0 / 1.25 * (1.0 - 1.0 / 9.0);
-        assert!((response(8, 12, 2) - expected).abs() < 1e-5, "{}", response(8, 12, 2));
+        assert!((response(8, 12, 2) - expected).abs() < 1e-3, "{}", response(8, 12, 2));
         // At the border, too, where cells and blocks are cut off.
-        assert!([(0, 0, 2), (20, 12, 4), (32, 24, 4), (32, 24, 2)].into_iter().all(|(x, y, size)| response(x, y, size) < 1e-5));
+        assert!([(0, 0, 2), (20, 12, 4), (32, 24, 4), (32, 24, 2)].into_iter().all(|(x, y, size)| response(x, y, size) < 1e-3));
     }
 }
