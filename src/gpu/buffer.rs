@@ -97,7 +97,7 @@ impl GpuBuffer {
         }
     }
 
-    /// Writes the first of `words` without a copy of them on the host; it takes effect before the next submission.
+    /// Writes `words` from the start on, without a copy of them on the host; it takes effect before the next submission.
     pub fn write_words(&self, gpu: &Gpu, words: impl ExactSizeIterator<Item = u32>) {
         let Some(bytes) = std::num::NonZeroU64::new(words.len() as u64 * 4) else { return };
         let Some(mut view) = gpu.queue.write_buffer_with(&self.raw, self.offset, bytes) else { return };

@@ -23,16 +23,16 @@ const SAME_SURFACE_RATIO: f32 = 1.2;
 /// Discs seen more obliquely than this are drawn no longer.
 const MIN_COSINE: f64 = 0.35;
 
-/// What a keyframe by itself offers to insert.
-pub(super) struct Offer {
+/// Insertion candidates of a keyframe, before the comparison with the map.
+pub(super) struct Candidates {
     blocks: Vec<Block>,
     sums: ColorSums,
     /// Depth without holes, `[H, W]` metres.
     filled: Vec<f32>,
 }
 
-impl Offer {
-    /// That of an image with depth.
+impl Candidates {
+    /// Those of an image with depth; `None` without.
     pub fn new(image: &RectifiedImage, config: &InsertionConfig) -> Option<Self> {
         let depth = image.depth.as_ref()?;
         let of_colors = || {
@@ -44,18 +44,18 @@ impl Offer {
     }
 }
 
-/// Of what a keyframe of the given exposure offers, Gaussians for what the map lacks as it was surveyed from there. Without a survey they cover
-/// the whole image.
+/// New Gaussians: the candidates that the map lacks. `shown` has the survey of the map from the keyframe, and the keyframe's exposure. Without a
+/// survey all candidates are new.
 pub(super) fn gaussians(
     keyframe: &Keyframe,
-    offer: &Offer,
+    candidates: &Candidates,
     shown: (Option<&Survey>, &Exposure),
     config: &InsertionConfig,
     sh_degree: ShDegree,
 ) -> GaussianCloud {
     let mut cloud = GaussianCloud::new(sh_degree);
     let (survey, exposure) = shown;
-    let (image, Offer { blocks, sums, filled }) = (&keyframe.image, offer);
+    let (image, Candidates { blocks, sums, filled }) = (&keyframe.image, candidates);
     let (width, height) = image.color.dimensions();
     let missed = survey.map(|survey| Missed::new(sums, survey, exposure, config.stride));
     for &block in blocks {
@@ -207,8 +207,8 @@ mod tests {
     }
 
     fn inserted(frame: &Keyframe, survey: Option<&Survey>, config: &InsertionConfig) -> GaussianCloud {
-        let offer = Offer::new(&frame.image, config).unwrap();
-        gaussians(frame, &offer, (survey, &Exposure::default()), config, ShDegree::default())
+        let candidates = Candidates::new(&frame.image, config).unwrap();
+        gaussians(frame, &candidates, (survey, &Exposure::default()), config, ShDegree::default())
     }
 
     /// Cells of two pixels over an image of 32×24.
@@ -236,9 +236,9 @@ mod tests {
     fn colors_are_those_of_the_maps_exposure() {
         let frame = keyframe(RgbImage::from_pixel(32, 24, Rgb([90, 90, 255])), vec![1.0; 32 * 24]);
         let config = InsertionConfig::default();
-        let offer = Offer::new(&frame.image, &config).unwrap();
+        let candidates = Candidates::new(&frame.image, &config).unwrap();
         let exposure = Exposure([1.2f32.ln(), 0.0, 0.9f32.ln()]);
-        let cloud = gaussians(&frame, &offer, (None, &exposure), &config, ShDegree::ALL[0]);
+        let cloud = gaussians(&frame, &candidates, (None, &exposure), &config, ShDegree::ALL[0]);
         let expected = dc_from_color(Vec3::new(75.0 / 255.0, 90.0 / 255.0, 1.0));
         assert!(cloud.sh.iter().all(|sh| (*sh - expected).length() < 1e-5));
     }

@@ -6,9 +6,9 @@ use serde::{Deserialize, Serialize};
 use super::keyframe::MappedKeyframe;
 use crate::render::GaussianHistory;
 
-/// Bytes that the rasterizer's scratch and the scores take for each Gaussian.
-pub(super) const SCRATCH_BYTES_EACH: u64 = 124;
-/// Bytes for each in the list of those that stay, while the map changes.
+/// Bytes that the rasterizer's scratch, the scores and the verdicts take for each Gaussian.
+pub(super) const SCRATCH_BYTES_EACH: u64 = 128;
+/// Bytes for each in the list of changes, while the map changes: at most all of them go.
 pub(super) const LIST_BYTES_EACH: u64 = 4;
 /// Share of the memory that keyframes' images may take.
 const IMAGES_SHARE: f64 = 0.4;

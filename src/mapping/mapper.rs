@@ -21,7 +21,7 @@ pub use state::MapperState;
 use super::anchors::Anchors;
 use super::host_time::HostTimes;
 use super::image_store::ImageStore;
-use super::insertion::Offer;
+use super::insertion::Candidates;
 use super::keyframe::{DepthSource, MappedKeyframe};
 use super::plane_sweep::{self, SourceView};
 use super::schedule::{self, Step};
@@ -122,18 +122,19 @@ impl Mapper {
         // Before its insertion: a bound on memory leaves to it what the image has left.
         let mut mapped = self.timed("image", |mapper| mapper.upload(&keyframe))?;
         let config = self.config.clone();
-        let (offer, survey) = std::thread::scope(|scope| {
-            let offer = scope.spawn(|| Offer::new(&keyframe.image, &config.insertion));
+        let (candidates, survey) = std::thread::scope(|scope| {
+            let candidates = scope.spawn(|| Candidates::new(&keyframe.image, &config.insertion));
             let survey = self.timed("survey", |mapper| mapper.survey(&mapped, keyframe.image.depth.is_some()));
-            (offer.join().expect("the offer is made"), survey)
+            (candidates.join().expect("the candidates are found"), survey)
         });
         let survey = survey?;
         let exposure = self.timed("exposure", |mapper| mapper.exposure(&keyframe.image, survey.as_ref()));
         mapped.exposure = exposure;
         self.keyframes.push(mapped);
         self.limit_gpu_images()?;
-        let insert = |mapper: &mut Self, offer| mapper.insert_gaussians(&keyframe, &offer, (survey.as_ref(), &exposure));
-        let inserted = offer.map_or(Ok(0), |offer| self.timed("insertion", |mapper| insert(mapper, offer)))?;
+        let insert =
+            |mapper: &mut Self, candidates| mapper.insert_gaussians(&keyframe, &candidates, (survey.as_ref(), &exposure));
+        let inserted = candidates.map_or(Ok(0), |candidates| self.timed("insertion", |mapper| insert(mapper, candidates)))?;
         let first = self.keyframes.len() == 1;
         let iterations = if first { self.config.first_iterations } else { self.config.iterations_per_keyframe };
         if iterations == 0 {

@@ -46,12 +46,21 @@ impl DensityPasses {
     /// # Errors
     /// [`GpuError`] if a buffer does not fit.
     pub fn prepare(&mut self, gpu: &Gpu, setup: &DensitySetup) -> Result<(), GpuError> {
-        if setup.capacity != self.capacity {
-            self.words = GpuBuffer::storage(gpu, "verdicts", u64::from(setup.capacity) * 4)?;
-            self.capacity = setup.capacity;
-        }
+        self.reserve(gpu, setup.capacity)?;
         self.setup.write(gpu, 0, std::slice::from_ref(setup));
         self.count = setup.count;
+        Ok(())
+    }
+
+    /// Room for the verdicts on a map of such a capacity.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit.
+    pub fn reserve(&mut self, gpu: &Gpu, capacity: u32) -> Result<(), GpuError> {
+        if capacity != self.capacity {
+            self.words = GpuBuffer::storage(gpu, "verdicts", u64::from(capacity) * 4)?;
+            self.capacity = capacity;
+        }
         Ok(())
     }
 

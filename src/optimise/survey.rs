@@ -75,12 +75,18 @@ impl SurveyPass {
         })
     }
 
-    fn reserve(&mut self, gpu: &Gpu, cells: u32) -> Result<(), GpuError> {
+    /// Room for so many cells.
+    pub fn reserve(&mut self, gpu: &Gpu, cells: u32) -> Result<(), GpuError> {
         let bytes = u64::from(cells.div_ceil(2)) * 4;
         if bytes > self.cells.size() {
             self.cells = GpuBuffer::storage(gpu, "surveyed cells", bytes)?;
         }
         Ok(())
+    }
+
+    /// Cells that there is room for.
+    pub fn capacity(&self) -> u32 {
+        self.cells.size() as u32 / 2
     }
 
     fn encode(

@@ -57,6 +57,10 @@ impl Mapper {
             return Err(MappingError::State);
         }
         mapper.trainer.restore(&state.trainer)?;
+        // Verdicts have the scores' capacity: what counts where memory is limited is as it was.
+        if state.trainer.scored() > 0 {
+            mapper.density.reserve(&mapper.gpu, state.trainer.scored() as u32)?;
+        }
         mapper.anchors = state.anchors.clone();
         mapper.rng = Rng::with_seed(state.rng);
         mapper.step_times = state.step_times.clone();

@@ -3,7 +3,7 @@
 
 use super::Mapper;
 use crate::gpu::GpuError;
-use crate::mapping::insertion::{self, Offer};
+use crate::mapping::insertion::{self, Candidates};
 use crate::mapping::keyframe::MappedKeyframe;
 use crate::mapping::{Keyframe, LimitsConfig, MappingError, limits};
 use crate::optimise::Survey;
@@ -36,14 +36,14 @@ impl Mapper {
         Ok(())
     }
 
-    /// Inserts of what a keyframe offers what the map lacks as it was surveyed; returns how many Gaussians.
+    /// Inserts the candidates that the map lacks; returns the number of new Gaussians.
     pub(super) fn insert_gaussians(
         &mut self,
         keyframe: &Keyframe,
-        offer: &Offer,
+        candidates: &Candidates,
         shown: (Option<&Survey>, &Exposure),
     ) -> Result<usize, MappingError> {
-        let mut new = insertion::gaussians(keyframe, offer, shown, &self.config.insertion, self.config.sh_degree);
+        let mut new = insertion::gaussians(keyframe, candidates, shown, &self.config.insertion, self.config.sh_degree);
         let limited = self.config.limits.limits_gaussians();
         if limited {
             self.cloud.limit(self.most_gaussians());

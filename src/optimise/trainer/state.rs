@@ -15,8 +15,18 @@ pub struct TrainerState {
     steps: usize,
     /// Width and height of the views that there are buffers for, the latest first.
     sizes: Vec<(u32, u32)>,
+    /// Gaussians that there is room for among the scores.
     scored: usize,
+    /// Cells that there is room for in a survey.
+    surveyed: u32,
     rasterizer: Capacities,
+}
+
+impl TrainerState {
+    /// Gaussians that there is room for among the scores; none before the first are scored.
+    pub fn scored(&self) -> usize {
+        self.scored
+    }
 }
 
 impl Trainer {
@@ -26,6 +36,7 @@ impl Trainer {
             steps: self.steps,
             sizes: self.images.iter().map(|images| images.size).collect(),
             scored: self.scores.capacity(),
+            surveyed: self.survey.capacity(),
             rasterizer: self.rasterizer.capacities(),
         }
     }
@@ -41,6 +52,7 @@ impl Trainer {
         for size in state.sizes.iter().rev() {
             image_buffers::choose(&mut self.images, gpu, *size)?;
         }
+        self.survey.reserve(gpu, state.surveyed)?;
         if state.scored > 0 { self.scores.reserve(gpu, state.scored) } else { Ok(()) }
     }
 }
