@@ -3,6 +3,7 @@
 mod ablation;
 mod host;
 mod sweep;
+mod track;
 
 use std::path::{Path, PathBuf};
 
@@ -36,6 +37,8 @@ enum What {
     Ablation(ablation::AblationArgs),
     /// Whole runs over sequences, numbers of steps and seeds: what time buys, as table and curves.
     Sweep(sweep::SweepArgs),
+    /// The tracker on many replays of recordings: start frames, directions, missing frames; distributions of its errors.
+    Track(track::TrackArgs),
     /// Changes between two sweeps.
     Compare(sweep::CompareArgs),
 }
@@ -111,6 +114,7 @@ pub fn bench(args: &BenchArgs, verbosity: Verbosity) -> miette::Result<()> {
         What::Host(args) => host::host(args),
         What::Ablation(args) => ablation::ablation(args),
         What::Sweep(args) => sweep::sweep(args, verbosity),
+        What::Track(args) => track::track(args, verbosity),
         What::Compare(args) => sweep::compare(args),
     }
 }

@@ -58,7 +58,7 @@ impl GpuBuffer {
         if size > limit {
             return Err(GpuError::TooLarge { label: label.into(), needed: size, limit });
         }
-        let raw = allocate(gpu, label, size, usage)?;
+        let raw = allocate(gpu, label, size, usage, false)?;
         gpu.memory.add(size);
         Ok(Self { raw, offset: 0, size, memory: Some(gpu.memory.clone()), identity: Arc::default() })
     }
@@ -90,21 +90,16 @@ impl GpuBuffer {
 
     /// Writes `values` from element `first` (of their own size) on; it takes effect before the next submission.
     pub fn write<T: Pod>(&self, gpu: &Gpu, first: usize, values: &[T]) {
-        if !values.is_empty() {
-            let at = self.offset + (first * std::mem::size_of::<T>()) as u64;
-            gpu.queue.write_buffer(&self.raw, at, bytemuck::cast_slice(values));
-            gpu.traffic.uploaded();
-        }
+        let at = self.offset + (first * std::mem::size_of::<T>()) as u64;
+        let bytes: &[u8] = bytemuck::cast_slice(values);
+        gpu.upload(&self.raw, at, bytes.len() as u64, |mut to| to.copy_from_slice(bytes));
     }
 
     /// Writes `words` from the start on, without a copy of them on the host; it takes effect before the next submission.
     pub fn write_words(&self, gpu: &Gpu, words: impl ExactSizeIterator<Item = u32>) {
-        let Some(bytes) = std::num::NonZeroU64::new(words.len() as u64 * 4) else { return };
-        let Some(mut view) = gpu.queue.write_buffer_with(&self.raw, self.offset, bytes) else { return };
-        for (to, word) in view.slice(..).into_chunks::<4>().0.into_iter().zip(words) {
-            to.write(word.to_ne_bytes());
-        }
-        gpu.traffic.uploaded();
+        gpu.upload(&self.raw, self.offset, words.len() as u64 * 4, |to| {
+            to.into_chunks::<4>().0.into_iter().zip(words).for_each(|(to, word)| to.write(word.to_ne_bytes()));
+        });
     }
 
     /// Elements `first` to before `first + count`, to be read with others by [`Gpu::read`].
@@ -127,18 +122,18 @@ impl Gpu {
     pub fn has_room(&self, bytes: u64) -> bool {
         let largest = self.max_storage_bytes();
         let sizes = (0..bytes.div_ceil(largest)).map(|i| largest.min(bytes - i * largest));
-        let pieces = sizes.map(|size| allocate(self, "trial", size.next_multiple_of(16), BufferUsages::STORAGE));
+        let pieces = sizes.map(|size| allocate(self, "trial", size.next_multiple_of(16), BufferUsages::STORAGE, false));
         !self.memory.is_beyond(bytes) && pieces.collect::<Result<Vec<_>, _>>().is_ok()
     }
 }
 
-/// A wgpu buffer. An adapter without the memory for it refuses at once, and goes on working.
-pub(super) fn allocate(gpu: &Gpu, label: &str, size: u64, usage: BufferUsages) -> Result<wgpu::Buffer, GpuError> {
+/// A wgpu buffer, maybe mapped. An adapter without the memory for it refuses at once, and goes on working.
+pub(super) fn allocate(gpu: &Gpu, label: &str, size: u64, usage: BufferUsages, mapped: bool) -> Result<wgpu::Buffer, GpuError> {
     if gpu.memory.is_beyond(size) {
         return Err(GpuError::OutOfMemory(label.into()));
     }
     let scope = gpu.device.push_error_scope(wgpu::ErrorFilter::OutOfMemory);
-    let descriptor = wgpu::BufferDescriptor { label: Some(label), size, usage, mapped_at_creation: false };
+    let descriptor = wgpu::BufferDescriptor { label: Some(label), size, usage, mapped_at_creation: mapped };
     let raw = gpu.device.create_buffer(&descriptor);
     let refused = pollster::block_on(scope.pop());
     refused.map_or(Ok(raw), |error| Err(GpuError::OutOfMemory(format!("{label}: {error}"))))

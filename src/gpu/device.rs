@@ -9,6 +9,7 @@ use wgpu::{Backends, InstanceDescriptor, InstanceFlags};
 
 use super::profile::Profiler;
 use super::traffic::Traffic;
+use super::upload::UploadStaging;
 
 /// Failure of the adapter, the device or an allocation on it.
 #[derive(Debug, thiserror::Error)]
@@ -124,6 +125,7 @@ pub struct Gpu {
     pub(super) traffic: Traffic,
     /// For the next readback.
     pub(super) staging: Mutex<Option<wgpu::Buffer>>,
+    pub(super) upload_staging: UploadStaging,
     pub(super) profiler: Option<Profiler>,
 }
 
@@ -287,6 +289,7 @@ impl Gpu {
             memory: Arc::default(),
             traffic: Traffic::default(),
             staging: Mutex::default(),
+            upload_staging: UploadStaging::default(),
             profiler,
         })
     }

@@ -8,6 +8,7 @@ mod profile;
 mod readback;
 mod traffic;
 mod uniforms;
+mod upload;
 
 pub use buffer::GpuBuffer;
 pub use device::{AdapterSummary, Gpu, GpuError, adapters};

@@ -37,7 +37,10 @@ impl ReadBack<'_> {
             return Vec::new();
         }
         let bytes = &self.mapped[*mapped].1[bytes.clone()];
-        // The mapping has no alignment that a cast could rely on.
+        // Mappings are aligned in practice; nothing promises it.
+        if let Ok(elements) = bytemuck::try_cast_slice(bytes) {
+            return elements.to_vec();
+        }
         bytes.chunks_exact(std::mem::size_of::<T>()).map(bytemuck::pod_read_unaligned).collect()
     }
 }
@@ -99,7 +102,7 @@ impl Gpu {
     fn staging(&self, bytes: u64) -> Result<wgpu::Buffer, GpuError> {
         match self.take_staging().filter(|staging| staging.size() >= bytes) {
             Some(staging) => Ok(staging),
-            None => allocate(self, "readback", bytes, BufferUsages::MAP_READ | BufferUsages::COPY_DST),
+            None => allocate(self, "readback", bytes, BufferUsages::MAP_READ | BufferUsages::COPY_DST, false),
         }
     }
 

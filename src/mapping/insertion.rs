@@ -10,6 +10,7 @@ mod blocks;
 
 use glam::{Quat, Vec3};
 use nalgebra::{Point3, Rotation3, UnitQuaternion, Vector2, Vector3};
+use rayon::iter::{IndexedParallelIterator, IntoParallelRefIterator, ParallelIterator};
 
 use self::blocks::{Block, ColorSums, Missed};
 use super::{InsertionConfig, Keyframe};
@@ -19,6 +20,9 @@ use crate::splat::{Exposure, Gaussian, GaussianCloud, ShDegree, raw_opacity_from
 
 /// Sides of a hole whose depths differ by more than this factor belong to different surfaces.
 const SAME_SURFACE_RATIO: f32 = 1.2;
+
+/// Fewer blocks are not worth a task of the thread pool.
+const BLOCKS_A_TASK: usize = 1 << 10;
 
 /// Discs seen more obliquely than this are drawn no longer.
 const MIN_COSINE: f64 = 0.35;
@@ -53,26 +57,28 @@ pub(super) fn gaussians(
     config: &InsertionConfig,
     sh_degree: ShDegree,
 ) -> GaussianCloud {
-    let mut cloud = GaussianCloud::new(sh_degree);
     let (survey, exposure) = shown;
     let (image, Candidates { blocks, sums, filled }) = (&keyframe.image, candidates);
     let (width, height) = image.color.dimensions();
     let missed = survey.map(|survey| Missed::new(sums, survey, exposure, config.stride));
-    for &block in blocks {
+    let lacking = |block: Block, center: (u32, u32)| {
+        survey.is_none_or(|survey| lacks(survey, block, center, config.stride))
+            || missed.as_ref().is_some_and(|missed| missed.response(block) > config.missed_detail)
+    };
+    let new = |&block: &Block| {
         let center = block.center(config.stride, (width, height));
         let pixel = (center.1 * width + center.0) as usize;
         let metres = filled[pixel];
-        if image.is_valid(pixel)
-            && metres >= config.min_depth_metres
-            && metres <= config.max_depth_metres
-            && (survey.is_none_or(|survey| lacks(survey, block, center, config.stride))
-                || missed.as_ref().is_some_and(|m| m.response(block) > config.missed_detail))
-        {
+        let in_range = metres >= config.min_depth_metres && metres <= config.max_depth_metres;
+        (image.is_valid(pixel) && in_range && lacking(block, center)).then(|| {
             let slope = slope(filled, (width, height), center, block.size);
             let point = SurfacePoint { x: center.0, y: center.1, metres, slope };
-            cloud.push(gaussian(keyframe, &point, block.size, exposure, config));
-        }
-    }
+            gaussian(keyframe, &point, block.size, exposure, config)
+        })
+    };
+    let new: Vec<Gaussian> = blocks.par_iter().with_min_len(BLOCKS_A_TASK).filter_map(new).collect();
+    let mut cloud = GaussianCloud::new(sh_degree);
+    new.into_iter().for_each(|gaussian| cloud.push(gaussian));
     cloud
 }
 

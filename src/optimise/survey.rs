@@ -9,7 +9,7 @@ use crate::render::{GpuCloud, PreparedView, Rasterizer, shaders};
 use crate::splat::ViewCamera;
 
 /// Pixels that are sampled, at most: the median of their colours varies by a hundredth of their spread.
-const MAX_SAMPLES: u32 = 1 << 14;
+const MAX_SAMPLES: u32 = 1 << 13;
 
 /// What the map lacks, by a keyframe's depth.
 #[derive(Clone, Copy, Debug)]

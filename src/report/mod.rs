@@ -3,6 +3,7 @@
 pub mod curves;
 mod page;
 mod plots;
+pub mod replays;
 pub mod sweep;
 
 use std::path::{Path, PathBuf};

@@ -224,6 +224,11 @@ impl Sequence {
         self.entries[index].camera.as_ref().unwrap_or(&self.camera)
     }
 
+    /// Whether frames are loaded in any order at the same cost.
+    pub fn has_random_access(&self) -> bool {
+        self.video.is_none()
+    }
+
     /// Whether all frames have one camera.
     pub fn has_one_camera(&self) -> bool {
         self.entries.iter().all(|entry| entry.camera.is_none())

@@ -157,7 +157,7 @@ fn slug(name: &str) -> String {
 }
 
 /// A recording's name and folder; synthetic scenes are rendered where they are not yet.
-fn recording(sequence: &str, out: &Path, verbosity: Verbosity) -> miette::Result<(String, PathBuf)> {
+pub(super) fn recording(sequence: &str, out: &Path, verbosity: Verbosity) -> miette::Result<(String, PathBuf)> {
     let path = Path::new(sequence);
     if path.exists() {
         let name = path.file_stem().map_or_else(|| sequence.into(), |name| name.to_string_lossy().into_owned());

@@ -21,13 +21,17 @@ const VERDICT: u32 = VERDICT_BITS & !(SEEN | FAINT);
 
 /// The change that verdicts on all Gaussians lead to, `[N]`. At most `most` are left, undivided ones first.
 pub(super) fn plan(verdicts: &[u32], most: usize, config: &DensityConfig) -> Plan {
-    let faint_limit = median_score_of_faint(verdicts);
+    // Most Gaussians stay as they are.
+    let marked = (0..).zip(verdicts).filter(|(_, word)| **word & (VERDICT | FAINT) != 0);
+    let marked: Vec<(u32, u32)> = marked.map(|(i, word)| (i, *word)).collect();
+    let faint_limit = median_score_of_faint(&marked);
     let is_removed = |word: u32| word & VERDICT == VERDICT_REMOVE || (word & FAINT != 0 && score(word) > faint_limit);
-    let chosen = chosen(verdicts, config);
+    let scored = verdicts.iter().filter(|word| **word & SEEN != 0).count();
+    let chosen = chosen(&marked, scored, config);
     let mut chosen = chosen.iter().copied().peekable();
     let mut room = most.saturating_sub(verdicts.len());
     let mut plan = Plan::default();
-    for (i, &word) in (0..).zip(verdicts) {
+    for (i, word) in marked {
         let division = chosen.next_if(|(divided, _)| *divided == i).filter(|_| room > 0);
         if let Some(division) = division {
             plan.divided.push(division);
@@ -46,26 +50,26 @@ fn score(word: u32) -> f32 {
 
 /// Those to be divided if there is room, ascending: of those that are too coarse for several views at most a share of the scored ones, those
 /// with most error pixels first.
-fn chosen(verdicts: &[u32], config: &DensityConfig) -> Vec<(u32, Division)> {
+fn chosen(marked: &[(u32, u32)], scored: usize, config: &DensityConfig) -> Vec<(u32, Division)> {
     let division = |word: u32| match word & VERDICT {
         VERDICT_SPLIT => Some(Division::Split),
         VERDICT_CLONE => Some(Division::Clone),
         _ => None,
     };
-    let mut chosen: Vec<(u32, Division)> = (0..).zip(verdicts).filter_map(|(i, word)| Some((i, division(*word)?))).collect();
-    if config.strategy == DensityStrategy::MultiView {
-        let scored = verdicts.iter().filter(|word| *word & SEEN != 0).count();
-        let of = |(i, _): &(u32, Division)| score(verdicts[*i as usize]);
-        chosen.sort_unstable_by(|a, b| of(b).total_cmp(&of(a)).then(a.0.cmp(&b.0)));
-        chosen.truncate((config.multi_view.max_growth * scored as f32) as usize);
-        chosen.sort_unstable_by_key(|(i, _)| *i);
+    let dividing = marked.iter().filter_map(|&(i, word)| Some((i, division(word)?, score(word))));
+    let mut dividing: Vec<(u32, Division, f32)> = dividing.collect();
+    let most = (config.multi_view.max_growth * scored as f32) as usize;
+    if config.strategy == DensityStrategy::MultiView && dividing.len() > most {
+        dividing.sort_unstable_by(|a, b| b.2.total_cmp(&a.2).then(a.0.cmp(&b.0)));
+        dividing.truncate(most);
+        dividing.sort_unstable_by_key(|(i, ..)| *i);
     }
-    chosen
+    dividing.into_iter().map(|(i, division, _)| (i, division)).collect()
 }
 
 /// The score above which a faint Gaussian goes: the median of theirs.
-fn median_score_of_faint(verdicts: &[u32]) -> f32 {
-    let mut scores: Vec<f32> = verdicts.iter().filter(|word| *word & FAINT != 0).map(|word| score(*word)).collect();
+fn median_score_of_faint(marked: &[(u32, u32)]) -> f32 {
+    let mut scores: Vec<f32> = marked.iter().filter(|(_, word)| word & FAINT != 0).map(|(_, word)| score(*word)).collect();
     let middle = scores.len() / 2;
     if scores.is_empty() { f32::INFINITY } else { *scores.select_nth_unstable_by(middle, f32::total_cmp).1 }
 }

@@ -1,10 +1,15 @@
 //! Blocks of pixels, small where the colours vary, and what each of them misses.
 
 use image::RgbImage;
+use rayon::iter::{IndexedParallelIterator, ParallelIterator};
+use rayon::slice::ParallelSliceMut;
 
 use crate::mapping::InsertionConfig;
 use crate::optimise::Survey;
 use crate::splat::Exposure;
+
+/// Fewer rows of cells are not worth a task of the thread pool.
+const ROWS_A_TASK: usize = 16;
 
 /// A square of pixels that gets one Gaussian.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -117,15 +122,17 @@ impl Missed {
     pub fn new(colors: &ColorSums, survey: &Survey, exposure: &Exposure, cell: u32) -> Self {
         let size = (colors.0.width, colors.0.height);
         let factors = exposure.gains().to_array().map(|gain| 1.0 / (3.0 * 255.0 * f64::from(gain)));
-        let rows = size.1.div_ceil(cell);
-        let places = (0..rows).flat_map(|row| (0..survey.columns).map(move |column| (column * cell, row * cell)));
-        let missed = |(i, (x, y)): (usize, (u32, u32))| {
-            let (sums, pixels) = colors.sums((x, y), (x + cell, y + cell));
-            let recorded: f64 = (0..3).map(|k| f64::from(sums[k]) * factors[k]).sum();
-            [recorded - f64::from(survey.cell(i).brightness) * pixels]
-        };
-        let values = places.enumerate().map(missed);
-        Self { sums: Sums::new((survey.columns, rows), values, |a, b| a + b), cell, size }
+        let (columns, rows) = (survey.columns as usize, size.1.div_ceil(cell));
+        let mut missed = vec![[0.0]; columns * rows as usize];
+        missed.par_chunks_mut(columns).with_min_len(ROWS_A_TASK).enumerate().for_each(|(row, missed)| {
+            for (column, to) in missed.iter_mut().enumerate() {
+                let (x, y) = (column as u32 * cell, row as u32 * cell);
+                let (sums, pixels) = colors.sums((x, y), (x + cell, y + cell));
+                let recorded: f64 = (0..3).map(|k| f64::from(sums[k]) * factors[k]).sum();
+                *to = [recorded - f64::from(survey.cell(row * columns + column).brightness) * pixels];
+            }
+        });
+        Self { sums: Sums::new((survey.columns, rows), missed.into_iter(), |a, b| a + b), cell, size }
     }
 
     /// How a block differs from its surroundings in what is missed: the Laplacian of Gaussian at the block's scale, by boxes.
