@@ -1,6 +1,6 @@
 //! Sweeps as the program makes them: tables and curves, going on where one was interrupted, and one sweep against another.
 
-use crate::common::recording::{Finished, finish, keysplat, recording, scratch, skipped_without_adapter};
+use crate::common::recording::{Finished, copy_of_recording, finish, keysplat, recording, scratch, skipped_without_adapter};
 use keysplat::config::Config;
 use keysplat::mapping::MappingConfig;
 use std::path::Path;
@@ -76,9 +76,42 @@ fn presets_are_swept_with_their_own_epochs_or_with_all() {
 }
 
 #[test]
+fn a_recording_is_replayed_from_several_starts_in_both_directions() {
+    let out = scratch().join("track");
+    let replayed = || {
+        let mut command = keysplat(["bench", "track", recording().to_str().unwrap(), "--starts", "2", "--every", "1"]);
+        command.args(["--missing", "0,20", "--variant", "usual:", "--variant", "few: tracking.features=500", "--out"]).arg(&out);
+        finish(command).succeeded().stdout
+    };
+    let table = replayed();
+    assert!(table.contains("| recording | usual | 8 |") && table.contains("| recording | few | 8 |"), "{table}");
+    // Without times, which are the only figures that may differ.
+    let figures = || {
+        let csv = std::fs::read_to_string(out.join("track.csv")).unwrap();
+        csv.lines().map(|line| line.rsplit_once(',').unwrap().0.to_owned()).collect::<Vec<_>>()
+    };
+    let first = figures();
+    assert_eq!(first.len(), 17);
+    let all_frames = first.iter().filter(|line| line.contains(",0,false,1,0,24,")).count();
+    let backwards = first.iter().filter(|line| line.contains(",true,1,20,")).count();
+    assert_eq!((all_frames, backwards), (2, 4), "{first:?}");
+    replayed();
+    assert_eq!(figures(), first);
+    assert!(std::fs::read_to_string(out.join("track.svg")).unwrap().contains("share of replays"));
+}
+
+#[test]
 fn what_cannot_be_swept_or_compared_is_said() {
     let out = scratch().join("nothing");
     let wrong = keysplat(["bench".as_ref(), "sweep".as_ref(), "no-such-room".as_ref(), "--out".as_ref(), out.as_os_str()]);
     finish(wrong).refused(&["no-such-room", "room-clean"]);
+    let without_truth = copy_of_recording("without-truth");
+    std::fs::remove_file(without_truth.join("groundtruth.txt")).unwrap();
+    let mut wrong = keysplat(["bench", "track", without_truth.to_str().unwrap(), "--out"]);
+    wrong.arg(&out);
+    finish(wrong).refused(&["without-truth", "no ground truth"]);
+    let mut wrong = keysplat(["bench", "track", "--out"]);
+    wrong.arg(&out);
+    finish(wrong).refused(&["give recordings, or --rooms"]);
     compare(&out, &out).refused(&["sweep.json", "give a sweep's folder"]);
 }

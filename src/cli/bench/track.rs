@@ -185,7 +185,7 @@ impl Replay<'_> {
         std::thread::scope(|scope| {
             let (sender, receiver) = bounded(AHEAD);
             let frames = &frames;
-            scope.spawn(move || frames.iter().map(|&i| self.sequence.load(i)).try_for_each(|frame| sender.send(frame)));
+            scope.spawn(move || frames.iter().all(|&i| sender.send(self.sequence.load(i)).is_ok()));
             for frame in receiver {
                 // As in a run, a frame that cannot be read is passed over.
                 let Ok(frame) = frame else {
@@ -193,15 +193,12 @@ impl Replay<'_> {
                     continue;
                 };
                 let started = Instant::now();
-                // A first frame that no map can start from is followed by others.
-                lost += match tracker.track(&frame, true) {
-                    Ok(tracked) => usize::from(tracked.state == TrackingState::Lost),
-                    Err(error) => return Err(error).into_diagnostic(),
-                };
+                let tracked = tracker.track(&frame, true).into_diagnostic()?;
+                lost += usize::from(tracked.state == TrackingState::Lost);
                 seconds += started.elapsed().as_secs_f64();
             }
             tracker.finish().into_diagnostic()?;
-            Ok(())
+            Ok::<_, miette::Report>(())
         })?;
         let mut poses: Vec<_> = tracker.trajectory().into_iter().map(|(_, pose)| pose).collect();
         poses.sort_by(|a, b| a.timestamp_s.total_cmp(&b.timestamp_s));
