@@ -5,7 +5,7 @@ CARGO_HOME ?= $(HOME)/.cargo
 # Where rustup puts cargo, in case it was installed just now.
 export PATH := $(CARGO_HOME)/bin:$(PATH)
 
-.PHONY: demo test check gpu-static setup build quality-fixture
+.PHONY: demo test check gpu-static lane-widths setup build quality-fixture
 
 demo: build
 	target/release/keysplat demo --out out/demo
@@ -29,6 +29,11 @@ check: setup
 
 gpu-static: setup
 	scripts/gpu-static.sh
+
+# The GPU's tests with four and with sixteen lanes of Mesa's software adapter; its own width is that of the processor.
+lane-widths: setup
+	LP_NATIVE_VECTOR_WIDTH=128 KEYSPLAT_REQUIRE=adapter cargo test --release --test gpu
+	LP_NATIVE_VECTOR_WIDTH=512 KEYSPLAT_REQUIRE=adapter cargo test --release --test gpu
 
 setup:
 	@scripts/setup.sh
