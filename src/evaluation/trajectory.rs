@@ -9,6 +9,7 @@
 use nalgebra::Vector3;
 
 use crate::geometry::{self, Se3, Sim3, Trajectory};
+use crate::sequence::SensorKind;
 
 /// Two stamps further apart than this are not of the same moment (the TUM benchmark's value).
 pub const MAX_TIME_DIFFERENCE_S: f64 = 0.02;
@@ -23,6 +24,16 @@ pub enum Alignment {
     Rigid,
     /// Sim(3): monocular, whose scale is free.
     Similarity,
+}
+
+impl Alignment {
+    /// The alignment of a sensor's trajectories.
+    pub fn of(sensor: SensorKind) -> Self {
+        match sensor {
+            SensorKind::Mono => Self::Similarity,
+            SensorKind::Stereo | SensorKind::Rgbd => Self::Rigid,
+        }
+    }
 }
 
 /// Trajectories that cannot be aligned.

@@ -2,6 +2,7 @@
 
 use plotters::prelude::*;
 
+use super::names;
 use super::sweep::{Figure, Point, Spread, pareto};
 
 const PANEL: (u32, u32) = (460, 380);
@@ -48,13 +49,7 @@ pub fn draw(points: &[Point]) -> Result<String, String> {
 }
 
 fn sequences(points: &[Point]) -> Vec<(&str, RGBColor)> {
-    let mut names: Vec<&str> = Vec::new();
-    for point in points {
-        if !names.contains(&point.sequence.as_str()) {
-            names.push(&point.sequence);
-        }
-    }
-    names.into_iter().zip(COLORS.into_iter().cycle()).collect()
+    names(points, |point| &point.sequence).into_iter().zip(COLORS.into_iter().cycle()).collect()
 }
 
 fn panel(area: &Area<'_>, points: &[Point], figure: Figure) -> Drawn {

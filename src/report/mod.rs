@@ -17,6 +17,22 @@ use crate::run_folder::{History, outputs};
 /// The report's name in the run's folder.
 pub const REPORT: &str = "report.html";
 
+/// Distinct names, in the order of their first row.
+fn names<T>(rows: &[T], of: impl Fn(&T) -> &str) -> Vec<&str> {
+    let mut names: Vec<&str> = Vec::new();
+    for row in rows {
+        if !names.contains(&of(row)) {
+            names.push(of(row));
+        }
+    }
+    names
+}
+
+/// A cell of text in a CSV file.
+fn quoted(text: &str) -> String {
+    format!("\"{}\"", text.replace('"', "\"\""))
+}
+
 /// A report that cannot be made.
 #[derive(Debug, thiserror::Error)]
 pub enum ReportError {

@@ -4,14 +4,15 @@
 use std::fmt::Write;
 
 use plotters::prelude::*;
-use serde::{Deserialize, Serialize};
+
+use super::{names, quoted};
 
 const PANEL: (u32, u32) = (420, 320);
 /// Panels in a row of the plot.
 const COLUMNS: usize = 3;
 
 /// One replay of a recording.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct ReplayRow {
     /// Name of the recording, with the sensor if not all of it was used.
     pub recording: String,
@@ -21,9 +22,9 @@ pub struct ReplayRow {
     pub start: usize,
     /// Whether its frames came in reverse.
     pub backwards: bool,
-    /// Each how-many-eth frame was replayed.
+    /// Stride: of so many frames one was replayed.
     pub every: usize,
-    /// Share of these that were left out, percent.
+    /// Share of frames that were left out, percent.
     pub missing_percent: u32,
     /// Frames replayed.
     pub frames: usize,
@@ -38,7 +39,7 @@ pub struct ReplayRow {
 }
 
 /// What a variant does on a recording.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct Distribution {
     /// Name of the recording.
     pub recording: String,
@@ -57,7 +58,6 @@ pub struct Distribution {
     /// Mean time of the tracker, milliseconds.
     pub ms_per_frame: f64,
     /// All errors, centimetres, ascending.
-    #[serde(skip)]
     errors_cm: Vec<f64>,
 }
 
@@ -98,18 +98,8 @@ pub fn distributions(rows: &[ReplayRow]) -> Vec<Distribution> {
     all
 }
 
-fn names<T>(rows: &[T], of: impl Fn(&T) -> &str) -> Vec<&str> {
-    let mut names: Vec<&str> = Vec::new();
-    for row in rows {
-        if !names.contains(&of(row)) {
-            names.push(of(row));
-        }
-    }
-    names
-}
-
 /// A recording left out: the settings that the other recordings choose, on this one.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct LeftOut {
     /// Name of the recording.
     pub recording: String,
@@ -126,8 +116,13 @@ pub struct LeftOut {
 /// Cost of a variant over recordings: geometric mean of the ratios of its worst quarter to the best variant's.
 fn cost(variant: &str, all: &[Distribution], left_out: Option<&str>) -> f64 {
     let own = all.iter().filter(|d| d.variant == variant && left_out != Some(&d.recording));
-    let ratios: Vec<f64> = own.map(|d| (d.worst_quarter_cm / best(all, &d.recording).worst_quarter_cm).ln()).collect();
+    let ratios: Vec<f64> = own.map(|d| ratio(d.worst_quarter_cm, best(all, &d.recording).worst_quarter_cm).ln()).collect();
     (ratios.iter().sum::<f64>() / ratios.len().max(1) as f64).exp()
+}
+
+/// Ratio of two errors; two that failed are alike.
+fn ratio(error: f64, least: f64) -> f64 {
+    if error == least { 1.0 } else { error / least }
 }
 
 fn best<'a>(all: &'a [Distribution], recording: &str) -> &'a Distribution {
@@ -164,7 +159,6 @@ pub fn to_csv(rows: &[ReplayRow]) -> String {
     for row in rows {
         let ReplayRow { recording, variant, start, backwards, every, missing_percent, frames, lost, keyframes, .. } = row;
         let ate = row.ate_rmse_m.map_or_else(String::new, |metres| format!("{metres:.6}"));
-        let quoted = |text: &str| format!("\"{}\"", text.replace('"', "\"\""));
         let _ = writeln!(
             csv,
             "{},{},{start},{backwards},{every},{missing_percent},{frames},{lost},{keyframes},{ate},{:.3}",
@@ -208,7 +202,7 @@ pub fn to_markdown(all: &[Distribution]) -> String {
                 l.recording,
                 l.chosen,
                 l.best,
-                l.chosen_cm / l.best_cm
+                ratio(l.chosen_cm, l.best_cm)
             );
         }
     }
@@ -307,6 +301,9 @@ mod tests {
         assert_eq!(left.iter().map(|l| l.chosen.as_str()).collect::<Vec<_>>(), ["y", "y", "x"]);
         assert_eq!((left[2].chosen_cm, left[2].best_cm), (9.0, 3.0));
         assert!(leave_one_out(&all[..1]).is_empty());
+        let all_fail: Vec<ReplayRow> = ["x", "y"].map(|variant| row("d", variant, f64::INFINITY, 99)).into();
+        let with_failures = distributions(&[rows, all_fail].concat());
+        assert_eq!((cost("x", &with_failures, Some("c")), leave_one_out(&with_failures)[2].chosen.as_str()), (1.0, "x"));
         let svg = draw(&all).unwrap();
         assert_eq!(svg.matches("ATE RMSE, cm").count(), 3);
     }

@@ -5,6 +5,7 @@ use std::fmt::Write;
 
 use serde::{Deserialize, Serialize};
 
+use super::quoted;
 use crate::evaluation::Metrics;
 
 /// One run of a sweep.
@@ -266,7 +267,6 @@ pub fn to_csv(rows: &[SweepRow]) -> String {
     fn cell<T: ToString>(value: Option<T>) -> String {
         value.map_or_else(String::new, |v| v.to_string())
     }
-    let quoted = |text: &str| format!("\"{}\"", text.replace('"', "\"\""));
     let mut csv = String::from(
         "sequence,variant,seed,frames,frames_tracked,wall_s,ate_rmse_m,psnr_db,ssim,depth_l1_m,gaussians,iterations,peak_host_bytes,map_hash\n",
     );

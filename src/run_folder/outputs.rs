@@ -18,7 +18,6 @@ use crate::files::{WriteError, remove_partials, write_atomically};
 use crate::geometry::{Se3, Trajectory};
 use crate::gpu::{Gpu, GpuError};
 use crate::recording::Recording;
-use crate::sequence::SensorKind;
 use crate::splat::GaussianCloud;
 
 /// Poses of all tracked frames, TUM format.
@@ -229,7 +228,7 @@ pub fn evaluate(
     let (sequence, config) = (recording.sequence(), recording.config());
     remove_pictures(out)?;
     let truth = sequence.groundtruth.as_ref();
-    let alignment = alignment(sequence.sensor.kind());
+    let alignment = Alignment::of(sequence.sensor.kind());
     let errors = |estimate: &Trajectory| truth.and_then(|truth| evaluate_trajectory(truth, estimate, alignment).ok());
     let (all, keyframes) = (errors(input.trajectory), errors(&input.keyframes));
     remove_file(&out.join(DRAWING))?;
@@ -266,14 +265,6 @@ pub fn evaluate(
         },
         images,
     })
-}
-
-/// Mono has no metric scale.
-fn alignment(sensor: SensorKind) -> Alignment {
-    match sensor {
-        SensorKind::Mono => Alignment::Similarity,
-        SensorKind::Stereo | SensorKind::Rgbd => Alignment::Rigid,
-    }
 }
 
 /// Pictures of at most [`MAX_PICTURES`] held-out views, spread evenly. None is written after the first that fails.

@@ -163,14 +163,19 @@ pub(super) fn recording(sequence: &str, out: &Path, verbosity: Verbosity) -> mie
         let name = path.file_stem().map_or_else(|| sequence.into(), |name| name.to_string_lossy().into_owned());
         return Ok((name, path.into()));
     }
-    let Some((name, scene)) = SCENES.iter().find(|(name, _)| *name == sequence) else {
-        let names: Vec<&str> = SCENES.iter().map(|(name, _)| *name).collect();
-        return Err(miette!("there is no recording {sequence}; give its folder, or a synthetic scene: {}", names.join(", ")));
-    };
-    let scene: SceneConfig = toml::from_str(scene).into_diagnostic()?;
-    let folder = out.join("recordings").join(name);
+    let scene = scene(sequence)?;
+    let folder = out.join("recordings").join(sequence);
     generate::render_if_changed(&scene, &folder, verbosity)?;
-    Ok(((*name).into(), folder))
+    Ok((sequence.into(), folder))
+}
+
+/// The synthetic scene of a name.
+pub(super) fn scene(name: &str) -> miette::Result<SceneConfig> {
+    let Some((_, scene)) = SCENES.iter().find(|(scene, _)| *scene == name) else {
+        let names: Vec<&str> = SCENES.iter().map(|(name, _)| *name).collect();
+        return Err(miette!("there is no recording {name}; give its folder, or a synthetic scene: {}", names.join(", ")));
+    };
+    toml::from_str(scene).into_diagnostic()
 }
 
 impl Cell {

@@ -17,13 +17,13 @@ use miette::{IntoDiagnostic, miette};
 use rayon::iter::{IntoParallelRefIterator, ParallelIterator};
 
 use super::ablation::{Variant, parse_variant};
-use super::sweep::recording;
+use super::sweep::{recording, scene};
 use crate::cli::{Verbosity, generate, print, progress};
 
 /// Frames decoded ahead.
 const AHEAD: usize = 8;
 /// The room that other seeds furnish anew.
-const ROOM: &str = include_str!("../../../sequences/room-noisy.toml");
+const ROOM: &str = "room-noisy";
 const FIRST_ROOM_SEED: u64 = 101;
 const ROOM_FRAMES: usize = 150;
 
@@ -38,7 +38,7 @@ pub(super) struct TrackArgs {
     #[arg(long, default_value_t = 0)]
     rooms: u64,
     /// Start frames, spread over the first half of a recording; each replay goes on to the end.
-    #[arg(long, default_value_t = 10)]
+    #[arg(long, default_value_t = 10, value_parser = at_least_one)]
     starts: usize,
     /// Frames of a replay, at most.
     #[arg(long)]
@@ -46,11 +46,11 @@ pub(super) struct TrackArgs {
     /// Directions of replay. Videos are replayed forwards only.
     #[arg(long, value_delimiter = ',', value_enum, default_value = "forwards,backwards")]
     direction: Vec<Direction>,
-    /// Each how-many-eth frame is replayed.
-    #[arg(long, value_delimiter = ',', default_values_t = [1usize, 2])]
+    /// Strides: of every N frames one is replayed.
+    #[arg(long, value_delimiter = ',', default_values_t = [1usize, 2], value_parser = at_least_one)]
     every: Vec<usize>,
     /// Shares of frames that are missing, percent.
-    #[arg(long, value_delimiter = ',', default_values_t = [0u32, 5, 10])]
+    #[arg(long, value_delimiter = ',', default_values_t = [0u32, 5, 10], value_parser = clap::value_parser!(u32).range(..100))]
     missing: Vec<u32>,
     /// Sensors of which the recording's data is used: all of it by default.
     #[arg(long, value_delimiter = ',', value_enum)]
@@ -59,8 +59,12 @@ pub(super) struct TrackArgs {
     #[arg(long = "variant", value_name = "NAME: KEY=VALUE …", value_parser = parse_variant)]
     variants: Vec<Variant>,
     /// Replays at the same time; their times are longer for it.
-    #[arg(long, default_value_t = 1)]
+    #[arg(long, default_value_t = 1, value_parser = at_least_one)]
     jobs: usize,
+}
+
+fn at_least_one(text: &str) -> Result<usize, String> {
+    text.parse().ok().filter(|n| *n > 0).ok_or_else(|| "it must be a number from 1 on".into())
 }
 
 #[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -91,7 +95,7 @@ pub(super) fn track(args: &TrackArgs, verbosity: Verbosity) -> miette::Result<()
     let configs: Vec<(&str, &TrackingConfig)> = variants.iter().map(|v| v.name.as_str()).zip(&configs).collect();
     let replays = replays(args, &recordings, &configs);
     let bar = progress::bar(verbosity, replays.len() as u64, "{wide_bar} {pos}/{len} replays  {msg}");
-    let pool = rayon::ThreadPoolBuilder::new().num_threads(args.jobs.max(1)).build().into_diagnostic()?;
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(args.jobs).build().into_diagnostic()?;
     let measure = |replay: &Replay<'_>| {
         let row = replay.measure();
         bar.inc(1);
@@ -115,8 +119,8 @@ fn recordings(args: &TrackArgs, verbosity: Verbosity) -> miette::Result<Vec<(Str
         folders.push(recording(sequence, &args.out, verbosity)?);
     }
     for seed in (FIRST_ROOM_SEED..).take(args.rooms as usize) {
-        let scene: SceneConfig = toml::from_str(ROOM).into_diagnostic()?;
-        let folder = args.out.join("recordings").join(format!("room-noisy-{seed}"));
+        let scene = scene(ROOM)?;
+        let folder = args.out.join("recordings").join(format!("{ROOM}-{seed}"));
         generate::render_if_changed(&SceneConfig { seed, frames: ROOM_FRAMES, ..scene }, &folder, verbosity)?;
         folders.push(("rooms".into(), folder));
     }
@@ -173,7 +177,7 @@ impl Replay<'_> {
         let len = self.sequence.entries.len();
         let place = |i: usize| if self.direction == Direction::Backwards { len - 1 - i } else { i };
         let mut rng = fastrand::Rng::with_seed(self.start as u64);
-        let chosen = (self.start..len).step_by(self.every.max(1)).take(self.most);
+        let chosen = (self.start..len).step_by(self.every).take(self.most);
         chosen.filter(|_| rng.u32(..100) >= self.missing_percent).map(place).collect()
     }
 
@@ -202,10 +206,7 @@ impl Replay<'_> {
         })?;
         let mut poses: Vec<_> = tracker.trajectory().into_iter().map(|(_, pose)| pose).collect();
         poses.sort_by(|a, b| a.timestamp_s.total_cmp(&b.timestamp_s));
-        let alignment = match self.sequence.sensor.kind() {
-            SensorKind::Mono => Alignment::Similarity,
-            _ => Alignment::Rigid,
-        };
+        let alignment = Alignment::of(self.sequence.sensor.kind());
         let truth = self.sequence.groundtruth.as_ref().expect("checked when it was opened");
         let errors = evaluate_trajectory(truth, &Trajectory { poses }, alignment);
         Ok(ReplayRow {

@@ -7,6 +7,7 @@ use crate::evaluation::views::ViewRecord;
 use crate::geometry::StampedPose;
 use crate::mapping::KeyframeReport;
 use crate::run_folder::{FrameRecord, History, KeyframeRecord};
+use crate::sequence::SensorKind;
 use crate::splat::{Exposure, ShDegree};
 use crate::synthetic::{self, CameraConfig, SceneConfig};
 use crate::tracking::{KeyframePose, StageTimes};
@@ -100,7 +101,7 @@ fn no_picture_is_written_after_one_that_failed() {
 #[test]
 fn only_mono_is_aligned_by_a_similarity() {
     let sensors = [SensorKind::Mono, SensorKind::Stereo, SensorKind::Rgbd];
-    assert_eq!(sensors.map(alignment), [Alignment::Similarity, Alignment::Rigid, Alignment::Rigid]);
+    assert_eq!(sensors.map(Alignment::of), [Alignment::Similarity, Alignment::Rigid, Alignment::Rigid]);
 }
 
 #[test]
