@@ -30,7 +30,11 @@ fn main() -> Result<(), Box<dyn Error>> {
     let (mut times, mut lost, mut inliers) = (Vec::<StageTimes>::new(), Vec::new(), Vec::new());
     let mut shared = Vec::new();
     for index in 0..sequence.entries.len() {
-        let tracked = tracker.track(&sequence.load(index)?, (index + 1) % hold_out != 0)?;
+        let Ok(frame) = sequence.load(index) else {
+            lost.push(index);
+            continue;
+        };
+        let tracked = tracker.track(&frame, (index + 1) % hold_out != 0)?;
         times.push(tracked.times);
         inliers.push(tracked.inliers);
         shared.extend(tracked.keyframe.map(|k| k.covisible.first().map_or(0, |c| c.1)));

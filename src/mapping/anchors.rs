@@ -1,6 +1,6 @@
 //! The keyframe that each Gaussian was inserted from: when a closed loop moves a keyframe, its Gaussians go with it.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use serde::{Deserialize, Serialize};
 
@@ -40,6 +40,11 @@ impl Anchors {
         }
         self.0.truncate(kept);
         self.0.extend(children);
+    }
+
+    /// The Gaussians of some keyframes, ascending.
+    pub fn of(&self, keyframes: &BTreeSet<KeyframeId>) -> Vec<u32> {
+        (0..).zip(&self.0).filter(|(_, keyframe)| keyframes.contains(keyframe)).map(|(gaussian, _)| gaussian).collect()
     }
 
     pub fn len(&self) -> usize {
@@ -88,6 +93,7 @@ mod tests {
         let motions = [2, 5, 7].map(|keyframe| (keyframe, new_from_old)).into();
         assert_eq!(anchors.moved(&motions), [2..4, 4..5, 7..9].map(|run| RunMotion { run, new_from_old }));
         assert!(anchors.moved(&BTreeMap::new()).is_empty());
+        assert_eq!(anchors.of(&[2, 5, 7].into()), [2, 3, 4, 7, 8]);
         anchors.apply(&Plan::removing(vec![0, 8]));
         assert_eq!(anchors.0, [0, 2, 2, 5, 0, 0, 2]);
         anchors.apply(&Plan::default());

@@ -1,13 +1,13 @@
 //! The mapper: owns the Gaussians, their moments and the keyframe window.
 
 mod control;
+mod corrections;
 mod exposures;
 mod refine;
 mod state;
 mod within_limits;
 
 use std::borrow::Cow;
-use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -25,9 +25,7 @@ use super::insertion::Candidates;
 use super::keyframe::{DepthSource, MappedKeyframe};
 use super::plane_sweep::{self, SourceView};
 use super::schedule::{self, Step};
-use super::{
-    DensityConfig, InsertionConfig, Keyframe, KeyframeId, MappingConfig, MappingError, PoseUpdate, initialise_from_points,
-};
+use super::{DensityConfig, InsertionConfig, Keyframe, KeyframeId, MappingConfig, MappingError, initialise_from_points};
 use crate::geometry::Se3;
 use crate::gpu::Gpu;
 use crate::optimise::{AdamConfig, DensityPasses, OverScores, Survey, SurveyRules, Trainer, TrainingView};
@@ -162,25 +160,6 @@ impl Mapper {
         let left_out = self.cloud.append(&self.gpu, &new)?;
         self.anchors.append(anchor, new.len() - left_out);
         Ok(())
-    }
-
-    /// Moves earlier keyframes to better poses, one update each. The Gaussians inserted from a keyframe follow by a similarity once its moves
-    /// add up to more than a refinement; returns how many did. Unknown ids are those that were never sent to the mapper.
-    ///
-    /// # Errors
-    /// [`MappingError`] if a buffer does not fit or the device fails.
-    pub fn update_poses(&mut self, updates: &[PoseUpdate]) -> Result<usize, MappingError> {
-        let mut motions = BTreeMap::new();
-        let updates: BTreeMap<KeyframeId, &PoseUpdate> = updates.iter().map(|update| (update.keyframe, update)).collect();
-        for keyframe in &mut self.keyframes {
-            if let Some(update) = updates.get(&keyframe.id) {
-                let motion = keyframe.update_pose(&self.gpu, &mut self.images, update)?;
-                motions.extend(motion.map(|motion| (keyframe.id, motion)));
-            }
-        }
-        let moved = self.anchors.moved(&motions);
-        self.cloud.transform(&self.gpu, &moved)?;
-        Ok(moved.iter().map(|motion| motion.run.len()).sum())
     }
 
     /// Downloads the averaged parameters of all Gaussians. Blocks until the GPU is idle.

@@ -15,6 +15,8 @@ pub enum MapperMessage {
     Keyframe(Box<Keyframe>),
     /// New poses of earlier keyframes after bundle adjustment or a loop closure.
     PoseUpdate(Vec<PoseUpdate>),
+    /// Keyframes whose place in the world never became known, at the end.
+    Remove(Vec<KeyframeId>),
 }
 
 /// New pose of an earlier keyframe.

@@ -176,6 +176,7 @@ impl MapThread<'_> {
                 (None, true)
             }
             MapperMessage::PoseUpdate(updates) => (None, mapper.update_poses(&updates)? > 0),
+            MapperMessage::Remove(keyframes) => (None, mapper.remove_keyframes(&keyframes)? > 0),
             MapperMessage::Keyframe(keyframe) => {
                 let report = mapper.insert(&keyframe, stop)?;
                 (Some(report), report.inserted + report.iterations > 0)

@@ -50,7 +50,7 @@ impl<'a> KeyframeSender<'a> {
         match message {
             MapperMessage::PoseUpdate(updates) => self.add_poses(updates),
             MapperMessage::Keyframe(keyframe) => self.deferred += usize::from(self.waiting.replace(keyframe).is_some()),
-            points @ MapperMessage::Points(_) => return self.sender.send(points).is_ok(),
+            waits @ (MapperMessage::Points(_) | MapperMessage::Remove(_)) => return self.sender.send(waits).is_ok(),
         }
         self.retry()
     }
@@ -87,15 +87,18 @@ impl<'a> KeyframeSender<'a> {
         true
     }
 
-    /// Sends all that waits and the final poses; returns the number of keyframes that the mapper never received. No newer keyframe replaces
-    /// the one that waits.
-    pub fn finish(mut self, last: Vec<PoseUpdate>) -> usize {
+    /// Sends all that waits, the final poses, and the keyframes without a place in the world; returns the number of keyframes that the mapper
+    /// never received. No newer keyframe replaces the one that waits.
+    pub fn finish(mut self, last: Vec<PoseUpdate>, placeless: Vec<KeyframeId>) -> usize {
         self.add_poses(last);
         if !self.waiting_poses.is_empty() {
             let _ = self.sender.send(MapperMessage::PoseUpdate(self.waiting_poses.into_values().collect()));
         }
         if let Some(keyframe) = self.waiting {
             let _ = self.sender.send(MapperMessage::Keyframe(keyframe));
+        }
+        if !placeless.is_empty() {
+            let _ = self.sender.send(MapperMessage::Remove(placeless));
         }
         self.deferred
     }
@@ -132,7 +135,7 @@ impl TrackThread<'_> {
             };
             let lost = tracked.state == TrackingState::Lost;
             summary.frames.push(FrameRecord { frame: frame.index, lost, times: tracked.times });
-            let progress = TrackingProgress { frames_done: frame.index + 1, keyframes: tracker.keyframes().len(), lost };
+            let progress = TrackingProgress { frames_done: frame.index + 1, keyframes: tracker.keyframe_count(), lost };
             self.progress.tracking.force_push(progress);
             if !keyframes.retry() || !self.send(&mut keyframes, &rectifier, &frame, tracked) {
                 break;
@@ -145,12 +148,19 @@ impl TrackThread<'_> {
         });
         summary.trajectory = tracker.trajectory();
         summary.keyframes = tracker.keyframes();
+        let placeless = tracker.apart();
+        if !placeless.is_empty() {
+            tracing::warn!(
+                keyframes = placeless.len(),
+                "the camera was lost and began a submap whose place in the map was never recognised: its frames count as lost"
+            );
+        }
         let scales: BTreeMap<KeyframeId, f64> = adjusted.iter().map(|update| (update.id, update.scale)).collect();
         let last = |k: &KeyframePose| PoseUpdate {
             scale: scales.get(&k.id).copied().unwrap_or(1.0),
             ..PoseUpdate::rigid(k.id, k.world_from_camera)
         };
-        summary.deferred = keyframes.finish(summary.keyframes.iter().map(last).collect());
+        summary.deferred = keyframes.finish(summary.keyframes.iter().map(last).collect(), placeless);
         summary
     }
 
@@ -233,7 +243,7 @@ mod tests {
         let Ok(MapperMessage::Keyframe(sent)) = messages.try_recv() else { panic!("the keyframe that waited") };
         assert_eq!((sent.id, sent.world_from_camera), (3, moved(3, 4.0, 1.0).world_from_camera));
         assert!(sent.image.depth.unwrap().metres.iter().all(|metres| *metres == 2.5), "its depth is in the new scale");
-        assert_eq!(channel.finish(Vec::new()), 1, "keyframe 2 was replaced");
+        assert_eq!(channel.finish(Vec::new(), Vec::new()), 1, "keyframe 2 was replaced");
         drop(messages);
         assert!(!KeyframeSender::new(&sender, true).send(keyframe(4)));
     }
@@ -245,7 +255,7 @@ mod tests {
         [0, 1, 2].into_iter().for_each(|id| assert!(channel.send(keyframe(id))));
         assert!(channel.send(MapperMessage::PoseUpdate(vec![moved(0, 1.0, 2.0), moved(2, 1.0, 2.0)])));
         messages.iter().take(2).for_each(drop);
-        assert_eq!(channel.finish(vec![moved(0, 3.0, 1.5), moved(1, 2.0, 1.0), moved(2, 5.0, 1.5)]), 0);
+        assert_eq!(channel.finish(vec![moved(0, 3.0, 1.5), moved(1, 2.0, 1.0), moved(2, 5.0, 1.5)], vec![1]), 0);
         let Ok(MapperMessage::PoseUpdate(poses)) = messages.try_recv() else { panic!("poses come before the keyframe") };
         assert_eq!(poses, [moved(0, 3.0, 3.0), moved(1, 2.0, 1.0)]);
         let Ok(MapperMessage::Keyframe(last)) = messages.try_recv() else { panic!("the keyframe that waited") };

@@ -24,6 +24,7 @@ impl MessageDigest {
                 digest.update(point.color);
             }),
             MapperMessage::PoseUpdate(updates) => digest.update(plain(updates)),
+            MapperMessage::Remove(keyframes) => digest.update(plain(keyframes)),
             MapperMessage::Keyframe(keyframe) => {
                 let image = &keyframe.image;
                 digest.update(plain(&(keyframe.id, keyframe.world_from_camera, &keyframe.covisible, image.pinhole)));

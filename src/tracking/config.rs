@@ -2,12 +2,16 @@
 
 use serde::{Deserialize, Serialize};
 
+const FEATURES: usize = 1000;
+const FEATURES_WITH_DEPTH_IMAGES: usize = 2000;
+
 /// Settings of the tracker.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TrackingConfig {
-    /// Features kept per frame, over all pyramid levels.
-    pub features: usize,
+    /// Features kept per frame, over all pyramid levels. By default 2000 with depth images and 1000 without, where more of them are weaker landmarks.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub features: Option<usize>,
     /// Levels of the image pyramid.
     pub pyramid_levels: usize,
     /// Size ratio between neighbouring pyramid levels, above 1.
@@ -55,7 +59,7 @@ pub struct TrackingConfig {
 impl Default for TrackingConfig {
     fn default() -> Self {
         Self {
-            features: 1000,
+            features: None,
             pyramid_levels: 8,
             pyramid_scale: 1.2,
             fast_threshold: 20,
@@ -81,6 +85,11 @@ impl Default for TrackingConfig {
 }
 
 impl TrackingConfig {
+    /// Features kept per frame of a sensor with depth images or without.
+    pub fn features_kept(&self, has_depth_images: bool) -> usize {
+        self.features.unwrap_or(if has_depth_images { FEATURES_WITH_DEPTH_IMAGES } else { FEATURES })
+    }
+
     /// Checks every value; the message names the field and what it may be.
     ///
     /// # Errors
@@ -95,7 +104,8 @@ impl TrackingConfig {
             let good = value > low && value <= high;
             if good { Ok(()) } else { Err(format!("tracking.{name} is {value}; it must be above {low} and at most {high}")) }
         };
-        count("features", self.features, 100, 20_000)?;
+        let fewest = self.features_kept(false);
+        count("features", fewest, 100, 20_000)?;
         count("pyramid_levels", self.pyramid_levels, 1, 16)?;
         number("pyramid_scale", self.pyramid_scale, 1.01, 2.0)?;
         count("fast_threshold", self.fast_threshold.into(), 1, 200)?;
@@ -106,9 +116,9 @@ impl TrackingConfig {
         number("inverse_depth_sigma", self.inverse_depth_sigma, 0.0, 100.0)?;
         number("disparity_sigma", self.disparity_sigma, 0.0, 100.0)?;
         number("depth_edge_ratio", self.depth_edge_ratio, 0.0, 100.0)?;
-        count("min_initial_landmarks", self.min_initial_landmarks, 10, self.features)?;
-        count("min_inliers", self.min_inliers, 6, self.features)?;
-        count("min_relocalisation_inliers", self.min_relocalisation_inliers, self.min_inliers, self.features)?;
+        count("min_initial_landmarks", self.min_initial_landmarks, 10, fewest)?;
+        count("min_inliers", self.min_inliers, 6, fewest)?;
+        count("min_relocalisation_inliers", self.min_relocalisation_inliers, self.min_inliers, fewest)?;
         number("keyframe_overlap", self.keyframe_overlap, 0.0, 1.0)?;
         number("keyframe_translation", self.keyframe_translation, 0.0, 100.0)?;
         number("keyframe_rotation_rad", self.keyframe_rotation_rad, 0.0, std::f64::consts::PI)?;

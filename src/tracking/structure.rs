@@ -59,7 +59,7 @@ impl PosedView {
     /// [`TrackingError`] if OpenCV fails.
     pub fn new(frame: &Frame, camera: &Camera, world_from_camera: &Se3, config: &TrackingConfig) -> Result<Self, TrackingError> {
         let Camera { pinhole, .. } = *camera;
-        let extractor = Extractor::new(pinhole.width, pinhole.height, config);
+        let extractor = Extractor::new(pinhole.width, pinhole.height, config.features_kept(false), config);
         let front_end = FrontEnd { camera: *camera, sensor: Sensor::Mono, extractor };
         let features = front_end.features(frame, &luma(&frame.color), config)?.features;
         let color = |feature: &Feature| {

@@ -66,7 +66,7 @@ fn walk(t: f64) -> Se3 {
 }
 
 fn config() -> TrackingConfig {
-    TrackingConfig { features: 500, inverse_depth_sigma: 0.005, ..Default::default() }
+    TrackingConfig { features: Some(500), inverse_depth_sigma: 0.005, ..Default::default() }
 }
 
 fn tracker() -> Tracker {
@@ -233,6 +233,36 @@ fn a_closed_loop_takes_the_drift_out() {
 }
 
 #[test]
+fn a_lost_camera_begins_a_submap_that_joins_when_a_place_is_recognised() {
+    // Half a turn is missing, and nothing after it shows what was seen before, until the circle closes.
+    let frame = |i: usize| {
+        let gap_s = if i < 20 { 0.0 } else { 2.0 };
+        let frame = render(i, &turn(i));
+        Frame { timestamp_s: frame.timestamp_s + gap_s, ..frame }
+    };
+    let run = |last: usize| {
+        let mut tracker = tracker();
+        for i in (0..20).chain(45..last) {
+            assert_eq!(tracker.track(&frame(i), true).unwrap().state, TrackingState::Tracking, "frame {i}");
+        }
+        tracker.finish().unwrap();
+        tracker
+    };
+    let apart = run(52);
+    assert_eq!(apart.trajectory().iter().map(|(i, _)| *i).collect::<Vec<_>>(), (0..20).collect::<Vec<_>>());
+    assert_eq!(apart.keyframes().len() + apart.apart().len(), apart.keyframe_count());
+    assert!(!apart.apart().is_empty());
+    let joined = run(72);
+    assert!(joined.apart().is_empty());
+    let trajectory = joined.trajectory();
+    assert_eq!(trajectory.len(), 20 + 27);
+    for (i, pose) in trajectory {
+        let off = (turn(0).inverse() * turn(i)).inverse() * pose.world_from_camera;
+        assert!(off.translation.vector.norm() < 0.02 && off.rotation.angle() < 0.01, "frame {i}: {off}");
+    }
+}
+
+#[test]
 fn a_strange_place_is_not_taken_for_a_known_one() {
     let mut tracker = tracker();
     for i in 0..3 {
@@ -264,7 +294,7 @@ fn depth_may_be_missing_or_wrong_but_not_at_the_start() {
 
 #[test]
 fn unusable_input_is_refused_in_words() {
-    let bad = TrackingConfig { features: 0, ..Default::default() };
+    let bad = TrackingConfig { features: Some(0), ..Default::default() };
     assert!(Tracker::new(CAMERA, Sensor::Rgbd, &bad).unwrap_err().to_string().contains("tracking.features"));
     let mut small = render(0, &truth(0));
     small.color = RgbImage::new(32, 24);

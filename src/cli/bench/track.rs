@@ -12,7 +12,7 @@ use keysplat::geometry::Trajectory;
 use keysplat::report::replays::{ReplayRow, distributions, draw, to_csv, to_markdown};
 use keysplat::sequence::{SensorKind, Sequence};
 use keysplat::synthetic::SceneConfig;
-use keysplat::tracking::{Tracker, TrackingConfig, TrackingState};
+use keysplat::tracking::{Tracker, TrackingConfig};
 use miette::{IntoDiagnostic, miette};
 use rayon::iter::{IntoParallelRefIterator, ParallelIterator};
 
@@ -185,20 +185,16 @@ impl Replay<'_> {
         let frames = self.frames();
         let (name, config) = self.config;
         let mut tracker = Tracker::new(self.sequence.camera, self.sequence.sensor, config).into_diagnostic()?;
-        let (mut lost, mut seconds) = (0, 0.0);
+        let mut seconds = 0.0;
         std::thread::scope(|scope| {
             let (sender, receiver) = bounded(AHEAD);
             let frames = &frames;
             scope.spawn(move || frames.iter().all(|&i| sender.send(self.sequence.load(i)).is_ok()));
             for frame in receiver {
                 // As in a run, a frame that cannot be read is passed over.
-                let Ok(frame) = frame else {
-                    lost += 1;
-                    continue;
-                };
+                let Ok(frame) = frame else { continue };
                 let started = Instant::now();
-                let tracked = tracker.track(&frame, true).into_diagnostic()?;
-                lost += usize::from(tracked.state == TrackingState::Lost);
+                tracker.track(&frame, true).into_diagnostic()?;
                 seconds += started.elapsed().as_secs_f64();
             }
             tracker.finish().into_diagnostic()?;
@@ -206,6 +202,7 @@ impl Replay<'_> {
         })?;
         let mut poses: Vec<_> = tracker.trajectory().into_iter().map(|(_, pose)| pose).collect();
         poses.sort_by(|a, b| a.timestamp_s.total_cmp(&b.timestamp_s));
+        let lost = frames.len() - poses.len();
         let alignment = Alignment::of(self.sequence.sensor.kind());
         let truth = self.sequence.groundtruth.as_ref().expect("checked when it was opened");
         let errors = evaluate_trajectory(truth, &Trajectory { poses }, alignment);
@@ -218,7 +215,7 @@ impl Replay<'_> {
             missing_percent: self.missing_percent,
             frames: frames.len(),
             lost,
-            keyframes: tracker.keyframes().len(),
+            keyframes: tracker.keyframe_count(),
             ate_rmse_m: errors.ok().map(|errors| errors.ate_rmse_m),
             ms_per_frame: 1e3 * seconds / frames.len().max(1) as f64,
         })

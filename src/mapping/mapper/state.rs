@@ -74,12 +74,11 @@ impl Mapper {
     /// [`MappingError`] if a buffer does not fit or the device fails.
     pub fn insert_again(&mut self, keyframe: &Keyframe, state: &MapperState) -> Result<(), MappingError> {
         let not_the_same = || MappingError::NotTheSame { id: keyframe.id };
-        let is_next = state.keyframes.get(self.keyframes.len()).is_some_and(|then| then.id == keyframe.id);
-        if !is_next && self.keyframes.is_empty() && keyframe.image.depth.is_none() {
-            // Passed over then, too.
+        let Some(place) = state.keyframes.iter().position(|then| then.id == keyframe.id) else {
+            // Passed over then, too, or removed since.
             return Ok(());
-        }
-        let then = state.keyframes.get(self.keyframes.len()).filter(|then| then.id == keyframe.id).ok_or_else(not_the_same)?;
+        };
+        let then = state.keyframes.get(place).filter(|_| place == self.keyframes.len()).ok_or_else(not_the_same)?;
         let with_half = self.config.learns_at_half_size();
         let mapped = MappedKeyframe::restore(&self.gpu, &mut self.images, then, keyframe, with_half)?;
         self.keyframes.push(mapped.ok_or_else(not_the_same)?);

@@ -111,7 +111,7 @@ pub(super) fn follow(thread: &TrackThread<'_>, scene: &Scene<'_>) -> TrackSummar
             break;
         }
     }
-    summary.deferred = sender.finish(Vec::new());
+    summary.deferred = sender.finish(Vec::new(), Vec::new());
     summary.keyframes = follower.keyframes.iter().map(|known| known.pose).collect();
     summary
 }

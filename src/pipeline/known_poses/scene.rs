@@ -140,7 +140,7 @@ fn triangulate(recording: &Recording, progress: &Progress) -> Result<BTreeMap<us
     frames.retain(|(index, _)| !config.replay.is_held_out(*index));
     let frames: Vec<(usize, Se3)> = frames.iter().step_by(frames.len().div_ceil(MOST_VIEWS).max(1)).copied().collect();
     let tracking = TrackingConfig {
-        features: config.tracking.features.max(FEATURES),
+        features: Some(config.tracking.features_kept(false).max(FEATURES)),
         pixel_sigma: PIXEL_SIGMA_SHARE * config.tracking.pixel_sigma,
         ..config.tracking.clone()
     };

@@ -2,7 +2,7 @@
 //! (the windowed scheme of Mur-Artal & Tardós, *ORB-SLAM2*, 2017).
 //!
 //! A keyframe and those that share most landmarks with it may move, with all their landmarks; other keyframes that see these
-//! landmarks hold them in place. The first keyframe is the world and never moves. An [`Adjustment`] is a plain value that can be solved
+//! landmarks hold them in place. The first keyframe of a submap is its world and never moves. An [`Adjustment`] is a plain value that can be solved
 //! elsewhere while the map goes on: taking it in touches only what is still there.
 
 use crate::geometry::{Pinhole, Se3};
@@ -42,8 +42,9 @@ impl Adjustment {
 
     /// Global bundle adjustment; `None` with too many keyframes.
     pub fn of_all(map: &Map, config: &TrackingConfig) -> Option<Self> {
-        let all: Vec<usize> = (1..map.keyframes.len()).filter(|k| !map.culled.contains_key(k)).collect();
-        if all.len() > MAX_ADJUSTED { None } else { Self::new(map, &all, &[0], config) }
+        let living = (0..map.keyframes.len()).filter(|k| !map.culled.contains_key(k));
+        let (roots, free): (Vec<usize>, Vec<usize>) = living.partition(|k| map.is_root(*k));
+        if free.len() > MAX_ADJUSTED { None } else { Self::new(map, &free, &roots, config) }
     }
 
     /// Bundle adjustment of the keyframes `free` and all their landmarks, with `fixed` held constant.
@@ -129,7 +130,7 @@ pub fn adjust_window(map: &mut Map, keyframe: usize, rig: &Rig) {
 fn choose_window(map: &Map, keyframe: usize, config: &TrackingConfig) -> (Vec<usize>, Vec<usize>) {
     let neighbours = map.covisible(keyframe).into_iter().filter(|(_, shared)| *shared >= MIN_SHARED).map(|(k, _)| k);
     let mut free: Vec<usize> = std::iter::once(keyframe).chain(neighbours).take(config.window_keyframes).collect();
-    free.retain(|k| *k != 0);
+    free.retain(|k| !map.is_root(*k));
     let landmarks = map.landmarks_of(&free);
     let covisibility = map.covisibility(landmarks.into_iter());
     let mut fixed: Vec<usize> = covisibility.into_iter().map(|(k, _)| k).filter(|k| !free.contains(k)).take(MAX_FIXED).collect();

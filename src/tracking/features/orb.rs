@@ -72,13 +72,14 @@ struct Level {
 }
 
 impl Extractor {
-    pub fn new(width: u32, height: u32, config: &TrackingConfig) -> Self {
+    /// `features` are kept of each image.
+    pub fn new(width: u32, height: u32, features: usize, config: &TrackingConfig) -> Self {
         let scale = |level: usize| config.pyramid_scale.powi(level as i32);
         let total: f64 = (0..config.pyramid_levels).map(|l| 1.0 / scale(l)).sum();
         let levels = (0..config.pyramid_levels)
             .map(|l| Level {
                 size: Size::new((f64::from(width) / scale(l)).round() as i32, (f64::from(height) / scale(l)).round() as i32),
-                budget: (config.features as f64 / scale(l) / total).round() as usize,
+                budget: (features as f64 / scale(l) / total).round() as usize,
             })
             // A level must hold the border twice and something between.
             .take_while(|level| level.size.width > 2 * BORDER + 8 && level.size.height > 2 * BORDER + 8)
@@ -217,7 +218,7 @@ mod tests {
     use super::*;
 
     fn config() -> TrackingConfig {
-        TrackingConfig { features: 500, ..Default::default() }
+        TrackingConfig::default()
     }
 
     /// Random dots of many grey levels, blurred; the right half is of low contrast.
@@ -243,7 +244,7 @@ mod tests {
 
     #[test]
     fn features_cover_textured_and_faint_halves() {
-        let keypoints = extract(&Extractor::new(320, 240, &config()), &picture());
+        let keypoints = extract(&Extractor::new(320, 240, 500, &config()), &picture());
         let left = keypoints.iter().filter(|k| k.pixel.x < 160.0).count();
         assert!((300..=600).contains(&keypoints.len()), "{} features", keypoints.len());
         assert!(left > 100 && keypoints.len() - left > 100, "{left} of {} are on the left", keypoints.len());
@@ -254,7 +255,7 @@ mod tests {
     fn a_turned_picture_has_turned_angles_and_the_same_descriptors() {
         let picture = picture();
         let turned: Vec<u8> = picture.iter().rev().copied().collect();
-        let extractor = Extractor::new(320, 240, &config());
+        let extractor = Extractor::new(320, 240, 500, &config());
         let (a, b) = (extract(&extractor, &picture), extract(&extractor, &turned));
         let mut same = 0;
         for k in a.iter().filter(|k| k.octave == 0) {
@@ -269,7 +270,7 @@ mod tests {
 
     #[test]
     fn blank_pictures_have_no_features() {
-        assert!(extract(&Extractor::new(320, 240, &config()), &vec![0; 320 * 240]).is_empty());
-        assert!(extract(&Extractor::new(16, 16, &config()), &[0; 256]).is_empty());
+        assert!(extract(&Extractor::new(320, 240, 500, &config()), &vec![0; 320 * 240]).is_empty());
+        assert!(extract(&Extractor::new(16, 16, 500, &config()), &[0; 256]).is_empty());
     }
 }

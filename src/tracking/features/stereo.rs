@@ -179,8 +179,8 @@ mod tests {
 
     #[test]
     fn disparities_are_found_to_a_fraction_of_a_pixel() {
-        let config = TrackingConfig { features: 600, ..Default::default() };
-        let extractor = Extractor::new(320, 240, &config);
+        let config = TrackingConfig::default();
+        let extractor = Extractor::new(320, 240, 600, &config);
         let (left, right) = pair(12.3);
         let (left, right) = (extractor.pyramid(&left).unwrap(), extractor.pyramid(&right).unwrap());
         let (a, b) = (extractor.extract(&left).unwrap(), extractor.extract(&right).unwrap());

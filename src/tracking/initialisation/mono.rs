@@ -75,6 +75,7 @@ pub fn first_map(first: &FirstView, second: &SecondView<'_>, matches: &[Match], 
         matches.iter().map(|m| (first.features.features[m.query].pixel, features.features[m.feature].pixel)).collect();
     let found = two_views(&pixels, pinhole)?;
     let keyframe = |frame_index, timestamp_s, camera_from_world, features: &Arc<FrameFeatures>| Keyframe {
+        root: 0,
         frame_index,
         timestamp_s,
         camera_from_world,

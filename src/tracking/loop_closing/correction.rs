@@ -40,17 +40,22 @@ pub fn correct(map: &mut Map, found: &Recognised, edges: &mut Vec<Edge>, scale_i
     let before: Vec<Se3> = map.keyframes.iter().map(|k| k.camera_from_world).collect();
     let keyframe_from_place = found.corrected * Sim3::from(before[found.place]).inverse();
     let depth = map.keyframes[found.keyframe].features.median_depth().or_else(|| map.median_depth(found.keyframe)).unwrap_or(1.0);
-    let mut graph = PoseGraph { poses: before.iter().map(|p| Sim3::from(*p)).collect(), edges: Vec::new(), scale_is_free };
-    graph.edges = skeleton(map, depth);
     edges.push(Edge {
         huber: Some(HUBER_SIGMAS),
         ..edge(found.keyframe, found.place, keyframe_from_place, found.matches.len(), depth)
     });
-    graph.edges.extend(edges.iter());
-    graph.optimise(GRAPH_STEPS);
-    move_map(map, &before, &graph.poses, config);
+    let poses: Vec<Sim3> = before.iter().map(|p| Sim3::from(*p)).collect();
+    let after = if map.connects(found.keyframe, found.place) {
+        let mut graph = PoseGraph { poses, edges: skeleton(map, depth), scale_is_free };
+        graph.edges.extend(edges.iter());
+        graph.optimise(GRAPH_STEPS);
+        graph.poses
+    } else {
+        join(map, found, poses)
+    };
+    move_map(map, &before, &after, config);
     let living: Vec<usize> = (0..before.len()).map(|k| map.living(k)).collect();
-    let growth = |k: usize| 1.0 / graph.poses[living[k]].scale;
+    let growth = |k: usize| 1.0 / after[living[k]].scale;
     map.culled.iter_mut().for_each(|(k, held)| held.camera_from_parent.translation.vector *= growth(*k));
     map.carry_culled();
     let neighbours: Vec<usize> =
@@ -60,7 +65,22 @@ pub fn correct(map: &mut Map, found: &Recognised, edges: &mut Vec<Edge>, scale_i
     for neighbour in neighbours.into_iter().take(FUSED_NEIGHBOURS) {
         fuse(map, neighbour, &found.landmarks, rig);
     }
-    (1..graph.poses.len()).map(|k| MovedKeyframe { keyframe: k, growth: growth(k) }).collect()
+    let moved = (1..after.len()).filter(|k| after[living[*k]] != Sim3::from(before[living[*k]]));
+    moved.map(|k| MovedKeyframe { keyframe: k, growth: growth(k) }).collect()
+}
+
+/// Makes one submap of two that show the same place: the younger moves as a whole to where the older shows it. Returns all poses after it.
+fn join(map: &mut Map, found: &Recognised, mut poses: Vec<Sim3>) -> Vec<Sim3> {
+    let (current, place) = (map.keyframes[found.keyframe].root, map.keyframes[found.place].root);
+    // Where the place's submap lies in that of the keyframe.
+    let current_from_place = poses[found.keyframe].inverse() * found.corrected;
+    let (older, younger) = (current.min(place), current.max(place));
+    let younger_from_older = if younger == current { current_from_place } else { current_from_place.inverse() };
+    for (keyframe, pose) in map.keyframes.iter_mut().zip(&mut poses).filter(|(k, _)| k.root == younger) {
+        keyframe.root = older;
+        *pose = *pose * younger_from_older;
+    }
+    poses
 }
 
 /// The edges that hold the map together: each keyframe with the older one that it shares most with, and with others if that is much.

@@ -5,10 +5,12 @@
 //! as much as its own neighbours do, the landmarks must align rigidly, most of what should be seen must be seen, neighbours must agree,
 //! and the correction must be one that drift can explain.
 
+use nalgebra::Point3;
+
 use crate::geometry::{Se3, Sim3};
 use crate::tracking::features::matching::{Rules, match_all};
 use crate::tracking::features::projection::{PointMatch, ProjectionSearch};
-use crate::tracking::map::sparse_map::Map;
+use crate::tracking::map::sparse_map::{Keyframe, Map};
 use crate::tracking::rig::Rig;
 use crate::tracking::solvers::pose::{PoseObservation, optimise_pose};
 use crate::tracking::solvers::residual::InlierClass;
@@ -28,13 +30,14 @@ const PLACE_NEIGHBOURS: usize = 8;
 const PROJECTION_RADIUS: f64 = 6.0;
 const PROJECTION_SEARCH: ProjectionSearch =
     ProjectionSearch { taken: &[], coarser_octaves: 1, rules: Rules { max_distance: 60, ratio: 0.9, check_rotation: false } };
-/// Landmarks of the place that the keyframe must show, in number and as a share of what it should show.
-const MIN_INLIERS: usize = 40;
-const MIN_FOUND_SHARE: f64 = 0.15;
-/// Least inliers in a neighbour of the keyframe, and how many of how many neighbours must agree.
-const MIN_NEIGHBOUR_INLIERS: usize = 25;
-const NEIGHBOURS_ASKED: usize = 4;
-const NEIGHBOURS_AGREEING: usize = 2;
+/// Landmarks of the place that the keyframe and the neighbours that confirm it must show: each, together, and together as a share of what they
+/// should show.
+const MIN_INLIERS_EACH: usize = 20;
+const MIN_INLIERS: usize = 90;
+const MIN_FOUND_SHARE: f64 = 0.1;
+/// Neighbours of the keyframe that are searched for the place, and how many of them must confirm it.
+const NEIGHBOURS_SEARCHED: usize = 4;
+const NEIGHBOURS_CONFIRMING: usize = 2;
 /// Largest plausible drift: metres a metre of path, radians a radian of rotation, and constant parts; the
 /// scale within this factor.
 const MAX_DRIFT_SHARE: f64 = 0.15;
@@ -78,7 +81,7 @@ impl Search<'_> {
         let least = MIN_SCORE_SHARE * neighbour.map_or(0.0, |r| r.score);
         let mut chosen: Vec<usize> = Vec::new();
         for found in ranked.iter().filter(|r| r.score >= least && !is_connected(r.keyframe)) {
-            let old = found.keyframe + MIN_AGE <= keyframe;
+            let old = self.is_old(found.keyframe, keyframe);
             let same_place = || chosen.iter().any(|c| self.connected(*c).contains(&found.keyframe));
             if old && !same_place() {
                 chosen.push(found.keyframe);
@@ -88,6 +91,11 @@ impl Search<'_> {
             }
         }
         chosen
+    }
+
+    /// Whether a keyframe shows another place than `keyframe` as far as the map knows: long before it, or in another submap.
+    fn is_old(&self, other: usize, keyframe: usize) -> bool {
+        other + MIN_AGE <= keyframe || !self.map.connects(other, keyframe)
     }
 
     /// Keyframes that share enough landmarks with a keyframe, strongest first.
@@ -100,44 +108,55 @@ impl Search<'_> {
     pub fn recognise(&self, keyframe: usize, place: usize) -> Option<Recognised> {
         let aligned = self.align(keyframe, place)?;
         let mut around = vec![place];
-        around.extend(self.connected(place).into_iter().filter(|k| *k + MIN_AGE <= keyframe).take(PLACE_NEIGHBOURS));
+        around.extend(self.connected(place).into_iter().filter(|k| self.is_old(*k, keyframe)).take(PLACE_NEIGHBOURS));
         let landmarks = self.map.landmarks_of(&around);
         let rough = aligned * Sim3::from(self.map.keyframes[place].camera_from_world);
         let seen = self.search_in(&landmarks, keyframe, &rough.to_rigid());
-        if seen.matches.len() < MIN_INLIERS || (seen.matches.len() as f64) < MIN_FOUND_SHARE * seen.expected as f64 {
-            return None;
-        }
         let current = self.map.keyframes[keyframe].camera_from_world;
-        let agrees = |neighbour: &usize| {
+        let in_neighbour = |neighbour: &usize| {
             let neighbour_from_keyframe = self.map.keyframes[*neighbour].camera_from_world * current.inverse();
             // The neighbours' motion in the place's unit.
             let mut motion = neighbour_from_keyframe;
             motion.translation.vector /= rough.scale;
-            let seen = self.search_in(&landmarks, *neighbour, &(motion * seen.camera_from_world));
-            seen.matches.len() >= MIN_NEIGHBOUR_INLIERS
+            self.search_in(&landmarks, *neighbour, &(motion * seen.camera_from_world))
         };
-        let agreeing = self.connected(keyframe).iter().take(NEIGHBOURS_ASKED).filter(|k| agrees(k)).count();
+        let mut confirming: Vec<Seen> = self.connected(keyframe).iter().take(NEIGHBOURS_SEARCHED).map(in_neighbour).collect();
+        confirming.sort_by_key(|seen| std::cmp::Reverse(seen.matches.len()));
+        confirming.truncate(NEIGHBOURS_CONFIRMING);
+        let views = || confirming.iter().chain([&seen]);
+        let found: usize = views().map(|seen| seen.matches.len()).sum();
+        let expected: usize = views().map(|seen| seen.expected).sum();
+        let confirmed = confirming.len() == NEIGHBOURS_CONFIRMING
+            && views().all(|seen| seen.matches.len() >= MIN_INLIERS_EACH)
+            && found >= MIN_INLIERS
+            && found as f64 >= MIN_FOUND_SHARE * expected as f64;
         let corrected = Sim3 {
             rotation: seen.camera_from_world.rotation,
             translation: seen.camera_from_world.translation.vector * rough.scale,
             scale: rough.scale,
         };
-        if agreeing < NEIGHBOURS_AGREEING || !self.plausible(keyframe, place, &corrected) {
+        if !confirmed || !self.plausible(keyframe, place, &corrected) {
             return None;
         }
         Some(Recognised { keyframe, place, corrected, matches: seen.matches, landmarks })
     }
 
-    /// keyframe_from_place, from landmarks whose features match.
+    /// The point that a feature shows: its landmark, or where its depth was measured.
+    fn point_in_camera(&self, keyframe: &Keyframe, feature: usize) -> Option<Point3<f64>> {
+        let landmark = keyframe.landmarks[feature].map(|l| keyframe.camera_from_world * self.map.landmarks[l].position);
+        landmark.or_else(|| keyframe.features.point_in_camera(feature, &self.rig.pinhole))
+    }
+
+    /// keyframe_from_place, from features that match and whose points are known.
     fn align(&self, keyframe: usize, place: usize) -> Option<Sim3> {
         let (a, b) = (&self.map.keyframes[keyframe], &self.map.keyframes[place]);
-        let known: Vec<bool> = a.landmarks.iter().map(Option::is_some).collect();
+        let points: Vec<Option<Point3<f64>>> = (0..a.features.len()).map(|i| self.point_in_camera(a, i)).collect();
+        let known: Vec<bool> = points.iter().map(Option::is_some).collect();
         let matches = match_all(&a.features.features, &known, &b.features.features, &MATCH_RULES);
         let pair = |(i, j): (usize, usize)| {
-            let (p, q) = (&self.map.landmarks[a.landmarks[i]?], &self.map.landmarks[b.landmarks[j]?]);
             Some(Pair {
-                p_in_a: a.camera_from_world * p.position,
-                p_in_b: b.camera_from_world * q.position,
+                p_in_a: points[i]?,
+                p_in_b: self.point_in_camera(b, j)?,
                 in_a: a.features.features[i].measurement(&self.rig.config),
                 in_b: b.features.features[j].measurement(&self.rig.config),
             })
@@ -162,8 +181,11 @@ impl Search<'_> {
         Seen { camera_from_world: estimate.camera_from_world, matches, expected: visible.len() }
     }
 
-    /// Whether drift on the way from `place` to `keyframe` can explain the correction.
+    /// Whether drift on the way from `place` to `keyframe` can explain the correction. Nothing is known of the way between submaps.
     fn plausible(&self, keyframe: usize, place: usize, corrected: &Sim3) -> bool {
+        if !self.map.connects(keyframe, place) {
+            return true;
+        }
         let current = self.map.keyframes[keyframe].camera_from_world;
         let off = corrected.to_rigid().inverse() * current;
         let centre = |k: usize| self.map.keyframes[k].centre();

@@ -25,18 +25,21 @@ pub struct LoopCloser {
 }
 
 impl LoopCloser {
-    /// Closes a loop if `keyframe`, one of the newest, shows a place left long ago. Returns the keyframes that may have moved, in ascending
-    /// order; none if there was no loop.
+    /// Closes a loop if `keyframe`, one of the newest, shows a place left long ago, or joins its submap with another that shows the place.
+    /// Returns the keyframes that moved, in ascending order; none if no place was recognised.
     pub fn close(&mut self, map: &mut Map, keyframe: usize, rig: &Rig) -> Vec<MovedKeyframe> {
-        if self.last.is_some_and(|last| keyframe < last + REST) {
+        let rests = self.last.is_some_and(|last| keyframe < last + REST);
+        if rests && map.is_connected() {
             return Vec::new();
         }
         let search = Search { map, rig, scale_is_free: !knows_scale(map) };
-        let recognised = search.candidates(keyframe).into_iter().find_map(|place| search.recognise(keyframe, place));
+        let places = search.candidates(keyframe).into_iter().filter(|place| !rests || !map.connects(keyframe, *place));
+        let recognised = places.into_iter().find_map(|place| search.recognise(keyframe, place));
         let Some(recognised) = recognised else { return Vec::new() };
         let scale_is_free = search.scale_is_free;
         self.last = Some(keyframe);
-        tracing::info!(keyframe, place = recognised.place, landmarks = recognised.matches.len(), "loop closed");
+        let kind = if map.connects(keyframe, recognised.place) { "loop closed" } else { "submaps joined" };
+        tracing::info!(keyframe, place = recognised.place, landmarks = recognised.matches.len(), "{kind}");
         correct(map, &recognised, &mut self.edges, scale_is_free, rig)
     }
 

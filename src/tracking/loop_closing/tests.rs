@@ -63,6 +63,7 @@ pub(crate) fn drifted(step: &Sim3, with_depth: bool, config: &TrackingConfig) ->
         let (features, points) = view(id, &wall, with_depth);
         map.database.insert(id, &features);
         map.keyframes.push(Keyframe {
+            root: 0,
             frame_index: id,
             timestamp_s: id as f64,
             camera_from_world: drifted.to_rigid(),
@@ -132,4 +133,27 @@ fn no_loop_is_seen_where_there_is_none() {
         keyframe.camera_from_world = Se3::translation(30.0, 0.0, 0.0) * keyframe.camera_from_world;
     }
     assert!(closer.close(&mut map, newest, &Rig { pinhole: PINHOLE, config: config.clone() }).is_empty());
+}
+
+#[test]
+fn submaps_that_show_one_place_become_one() {
+    let config = TrackingConfig::default();
+    let rig = Rig { pinhole: PINHOLE, config: config.clone() };
+    for (scale, with_depth) in [(1.0, true), (1.25, false)] {
+        let mut map = drifted(&Sim3::identity(), with_depth, &config);
+        let first = map.keyframes.len();
+        let mut again = drifted(&Sim3::identity(), with_depth, &config);
+        again.keyframes.iter_mut().for_each(|k| k.camera_from_world.translation.vector *= scale);
+        again.landmarks.iter_mut().for_each(|l| l.position.coords *= scale);
+        map.append(again, &Se3::new(Vector3::new(300.0, 2.0, 1.0), Vector3::new(0.1, 0.3, 0.2)), &config);
+        let newest = map.keyframes.len() - 1;
+        assert!(!map.is_connected() && map.is_root(first) && map.connects(first, newest) && !map.connects(0, newest));
+        let moved = LoopCloser::default().close(&mut map, newest, &rig);
+        assert_eq!(moved.iter().map(|m| m.keyframe).collect::<Vec<_>>(), (first..=newest).collect::<Vec<_>>());
+        assert!(moved.iter().all(|m| (m.growth * scale - 1.0).abs() < 0.01));
+        assert!(map.is_connected());
+        let off = (0..first).map(|k| (map.keyframes[k].centre() - map.keyframes[first + k].centre()).norm()).fold(0.0, f64::max);
+        assert!(off < 0.02, "{off} m");
+        assert!(map.covisible(newest).iter().any(|(k, shared)| *k < first && *shared > 50));
+    }
 }

@@ -19,12 +19,16 @@ const COARSER: u8 = 1;
 const KEPT_NEWEST: usize = 5;
 
 /// Culls the redundant ones among the keyframes that share landmarks with `around`. `keep` names those that must stay; the first
-/// keyframe and the newest ones stay as well. Returns the culled ones in the order in which they went.
+/// keyframe of a submap and the newest ones stay as well. Returns the culled ones in the order in which they went.
 pub fn cull_around(map: &mut Map, around: usize, keep: impl Fn(usize) -> bool, config: &TrackingConfig) -> Vec<usize> {
     let oldest_kept = map.keyframes.len().saturating_sub(KEPT_NEWEST);
     let mut culled = Vec::new();
     for (keyframe, _) in map.covisible(around) {
-        if keyframe > 0 && keyframe < oldest_kept && !keep(keyframe) && is_redundant(map, keyframe) && cull(map, keyframe, config)
+        if !map.is_root(keyframe)
+            && keyframe < oldest_kept
+            && !keep(keyframe)
+            && is_redundant(map, keyframe)
+            && cull(map, keyframe, config)
         {
             culled.push(keyframe);
         }
@@ -95,6 +99,7 @@ mod tests {
                 .collect();
             map.database.insert(id as usize, &features);
             map.keyframes.push(Keyframe {
+                root: 0,
                 frame_index: id as usize,
                 timestamp_s: t,
                 camera_from_world: se3::exp(&Vector6::new(t, 0.0, 0.0, 0.0, 0.1 * t, 0.0)),

@@ -59,6 +59,8 @@ pub struct Landmark {
 
 #[derive(Clone, Debug)]
 pub struct Keyframe {
+    /// The first keyframe of its submap. Submaps have no landmark in common and no known relative pose.
+    pub root: usize,
     pub frame_index: usize,
     pub timestamp_s: f64,
     pub camera_from_world: Se3,
@@ -86,6 +88,29 @@ pub struct Map {
 }
 
 impl Map {
+    /// Takes in another map's keyframes and landmarks; nothing connects them with those that are here.
+    pub fn append(&mut self, other: Self, world_from_other: &Se3, config: &TrackingConfig) {
+        let (keyframes, landmarks) = (self.keyframes.len(), self.landmarks.len());
+        let other_from_world = world_from_other.inverse();
+        for mut keyframe in other.keyframes {
+            keyframe.root += keyframes;
+            keyframe.camera_from_world *= other_from_world;
+            keyframe.landmarks.iter_mut().flatten().for_each(|l| *l += landmarks);
+            self.database.insert(self.keyframes.len(), &keyframe.features.features);
+            self.keyframes.push(keyframe);
+        }
+        for mut landmark in other.landmarks {
+            landmark.position = world_from_other * landmark.position;
+            landmark.first_keyframe += keyframes;
+            landmark.observations.iter_mut().for_each(|o| o.keyframe += keyframes);
+            if let LandmarkState::MergedInto(into) = &mut landmark.state {
+                *into += landmarks;
+            }
+            self.landmarks.push(landmark);
+        }
+        (landmarks..self.landmarks.len()).for_each(|l| self.refresh_geometry(l, config));
+    }
+
     /// A landmark first seen by `observation`.
     pub fn add_landmark(&mut self, observation: Observation, position: Point3<f64>, config: &TrackingConfig) -> usize {
         let id = self.landmarks.len();
@@ -241,6 +266,21 @@ impl Map {
         ranked
     }
 
+    /// Whether all keyframes are of one submap.
+    pub fn is_connected(&self) -> bool {
+        self.keyframes.iter().all(|k| k.root == 0)
+    }
+
+    /// Whether two keyframes are of one submap.
+    pub fn connects(&self, a: usize, b: usize) -> bool {
+        self.keyframes[a].root == self.keyframes[b].root
+    }
+
+    /// Whether a keyframe is the first of its submap, which never moves by itself.
+    pub fn is_root(&self, keyframe: usize) -> bool {
+        self.keyframes[keyframe].root == keyframe
+    }
+
     /// The keyframe itself if it lives, else the one that it goes with.
     pub fn living(&self, keyframe: usize) -> usize {
         self.culled.get(&keyframe).map_or(keyframe, |held| held.parent)
@@ -305,6 +345,7 @@ mod tests {
         let list = (0..10).map(|i| feature(50.0 * f64::from(i), 100.0, Descriptor([1 << i, 0, 0, 0]))).collect();
         let features = Arc::new(FrameFeatures::new(list, &PINHOLE));
         let keyframe = Keyframe {
+            root: 0,
             frame_index: 0,
             timestamp_s: 0.0,
             camera_from_world: Se3::identity(),

@@ -23,7 +23,7 @@ const MISSED: f64 = 1e-3;
 /// Three noisy points give a rough answer: its errors may be this much larger.
 const ROUGH_FACTOR: f64 = 3.0;
 /// Fewer pairs than this agree by chance.
-const MIN_INLIERS: usize = 12;
+const MIN_INLIERS: usize = 8;
 /// Standard deviation of the distance of a point in a keyframe without depth, as a share of it. Common errors of all points are
 /// the scale that is looked for; this is what remains of each.
 const KNOWN_DISTANCE_SIGMA: f64 = 0.1;

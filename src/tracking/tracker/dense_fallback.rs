@@ -1,4 +1,4 @@
-//! RGB-D frames whose features do not give a pose: all pixels do, for a while.
+//! RGB-D frames whose features do not give a pose: all pixels do, for a while. A false minimum looks like a pose after a gap.
 
 use std::sync::Arc;
 

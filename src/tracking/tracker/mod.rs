@@ -7,6 +7,7 @@ mod adjusting;
 mod dense_fallback;
 mod keyframe_selection;
 mod start;
+mod submaps;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -53,6 +54,8 @@ pub struct Tracker {
     lostness: Lostness,
     dense: DenseState,
     frames_seen: usize,
+    /// Timestamp of the frame before, and its distance from the one before it, seconds.
+    arrival: Option<(f64, Option<f64>)>,
     records: Vec<Record>,
     adjusting: Adjusting,
     /// Keyframes that moved since the last tracked frame, and the factor by which lengths around each have grown.
@@ -74,7 +77,7 @@ struct Motion {
 #[derive(Debug)]
 struct Lostness {
     is_lost: bool,
-    /// Consecutive frames without a pose.
+    /// Consecutive frames without a pose, missing ones among them.
     frames_lost: usize,
     /// Frames with a pose since relocalisation.
     frames_since_found: usize,
@@ -114,7 +117,8 @@ impl Tracker {
             ..config.clone()
         };
         let worker = Worker::start(pinhole, config.bundle_iterations)?;
-        let extractor = Extractor::new(pinhole.width, pinhole.height, &config);
+        let features = config.features_kept(sensor == Sensor::Rgbd);
+        let extractor = Extractor::new(pinhole.width, pinhole.height, features, &config);
         Ok(Self {
             dense: DenseState {
                 sampler: (sensor == Sensor::Rgbd).then(|| DenseSampler::new(&camera)),
@@ -129,6 +133,7 @@ impl Tracker {
             motion: Motion::default(),
             lostness: Lostness { is_lost: false, frames_lost: 0, frames_since_found: FRESHLY_FOUND_FRAMES },
             frames_seen: 0,
+            arrival: None,
             records: Vec::new(),
             adjusting: Adjusting::new(worker),
             moved: BTreeMap::new(),
@@ -151,6 +156,7 @@ impl Tracker {
     pub fn track(&mut self, frame: &Frame, may_be_keyframe: bool) -> Result<TrackedFrame, TrackingError> {
         self.check(frame)?;
         self.frames_seen += 1;
+        self.lostness.frames_lost += self.missing_before(frame);
         let mut times = StageTimes::default();
         let clock = Instant::now();
         let grey = luma(&frame.color);
@@ -161,8 +167,8 @@ impl Tracker {
         self.take_adjusted(&mut times)?;
         let mut tracked = match self.motion.last.take() {
             Some(last) => self.go_on(frame, features, dense.as_deref(), last, may_be_keyframe, times)?,
-            None if self.front_end.sensor == Sensor::Mono => self.start_without_depth(frame, features, may_be_keyframe, times),
-            None => self.start(frame, features, may_be_keyframe, times),
+            None if self.front_end.sensor == Sensor::Mono => self.start_without_depth(frame, features, may_be_keyframe, times)?,
+            None => self.start(frame, features, may_be_keyframe, times)?,
         };
         if tracked.state == TrackingState::Tracking {
             self.keep_dense(dense, tracked.keyframe.is_some());
@@ -192,23 +198,22 @@ impl Tracker {
             return self.accept(frame, features, &last, found, may_be_keyframe, times);
         }
         self.motion.last = Some(last);
-        self.lostness.frames_lost += 1;
-        self.lostness.is_lost = true;
-        self.motion.velocity = None;
-        Ok(TrackedFrame::lost(times))
+        self.lose(frame, features, may_be_keyframe, times)
     }
 
     /// Final pose of every tracked frame (index in the sequence, pose), each carried by its reference keyframe so that later
-    /// corrections of keyframes move it. Lost frames are absent.
+    /// corrections of keyframes move it. Lost frames are absent, and those of submaps that never joined the largest one.
     pub fn trajectory(&self) -> Vec<(usize, StampedPose)> {
+        let largest = self.largest_submap();
         let pose = |r: &Record| (r.camera_from_reference * self.map.keyframes[r.reference].camera_from_world).inverse();
         self.records
             .iter()
+            .filter(|r| self.map.keyframes[r.reference].root == largest)
             .map(|r| (r.frame_index, StampedPose { timestamp_s: r.timestamp_s, world_from_camera: pose(r) }))
             .collect()
     }
 
-    /// All keyframes with their current poses; a keyframe's id is its place.
+    /// The keyframes of the largest submap with their current poses.
     pub fn keyframes(&self) -> Vec<KeyframePose> {
         let pose = |(id, k): (usize, &Keyframe)| KeyframePose {
             id,
@@ -216,7 +221,13 @@ impl Tracker {
             timestamp_s: k.timestamp_s,
             world_from_camera: k.camera_from_world.inverse(),
         };
-        self.map.keyframes.iter().enumerate().map(pose).collect()
+        let largest = self.largest_submap();
+        self.map.keyframes.iter().enumerate().filter(|(_, k)| k.root == largest).map(pose).collect()
+    }
+
+    /// How many keyframes there have been, of all submaps.
+    pub fn keyframe_count(&self) -> usize {
+        self.map.keyframes.len()
     }
 
     /// How many keyframes have not been culled.
@@ -287,6 +298,7 @@ impl Tracker {
         self.motion.velocity = (!self.lostness.is_lost).then(|| found.camera_from_world * last.camera_from_world.inverse());
         self.lostness.is_lost = false;
         self.lostness.frames_lost = 0;
+        self.first_view = None;
         let covisibility = self.map.covisibility(found.landmarks.iter().flatten().copied());
         self.motion.reference = covisibility.first().map_or(self.motion.reference, |(k, _)| *k);
         let due =
@@ -312,6 +324,7 @@ impl Tracker {
         let Some(LastFrame { features, camera_from_world, landmarks }) = self.motion.last.take() else { return Ok(None) };
         let clock = Instant::now();
         let keyframe = Keyframe {
+            root: self.map.keyframes[self.motion.reference].root,
             frame_index: frame.index,
             timestamp_s: frame.timestamp_s,
             camera_from_world,

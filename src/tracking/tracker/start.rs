@@ -1,8 +1,8 @@
-//! How a map begins: with one frame where there is depth, else with two.
+//! How a submap begins: with one frame where there is depth, else with two.
 
 use std::sync::Arc;
 
-use super::{Record, Tracker};
+use super::{Lostness, Motion, Record, Tracker};
 use crate::geometry::Se3;
 use crate::sequence::Frame;
 use crate::tracking::features::frame_features::FrameFeatures;
@@ -10,74 +10,75 @@ use crate::tracking::initialisation::mono::{self, FirstView, SecondView};
 use crate::tracking::localisation::localise::LastFrame;
 use crate::tracking::map::insertion;
 use crate::tracking::map::sparse_map::Keyframe;
-use crate::tracking::{StageTimes, TrackedFrame, TrackingState};
+use crate::tracking::{StageTimes, TrackedFrame, TrackingError, TrackingState};
 
 impl Tracker {
-    /// Starts the map with a frame that shows enough.
-    pub(super) fn start(&mut self, frame: &Frame, features: Arc<FrameFeatures>, may: bool, times: StageTimes) -> TrackedFrame {
+    /// Starts a submap with a frame that shows enough.
+    pub(super) fn start(
+        &mut self,
+        frame: &Frame,
+        features: Arc<FrameFeatures>,
+        may: bool,
+        times: StageTimes,
+    ) -> Result<TrackedFrame, TrackingError> {
         let with_depth = features.features.iter().filter(|f| f.depth_metres.is_some()).count();
         if !may || with_depth < self.rig.config.min_initial_landmarks {
-            return TrackedFrame::lost(times);
+            return Ok(TrackedFrame::lost(times));
         }
+        let camera_from_world = self.next_submap().inverse();
         let keyframe = Keyframe {
+            root: self.map.keyframes.len(),
             frame_index: frame.index,
             timestamp_s: frame.timestamp_s,
-            camera_from_world: Se3::identity(),
+            camera_from_world,
             features: features.clone(),
             landmarks: Vec::new(),
         };
         let id = insertion::insert_keyframe(&mut self.map, keyframe, &self.rig);
         let landmarks = self.map.keyframes[id].landmarks.clone();
-        self.motion.last = Some(LastFrame { features, camera_from_world: Se3::identity(), landmarks });
         self.record(frame, id, Se3::identity());
-        TrackedFrame {
-            state: TrackingState::Tracking,
-            world_from_camera: Some(Se3::identity()),
-            inliers: with_depth,
-            keyframe: Some(self.describe(id)),
-            updates: Vec::new(),
-            times,
-        }
+        let started = self.started(LastFrame { features, camera_from_world, landmarks }, id, times);
+        Ok(TrackedFrame { inliers: with_depth, ..started })
     }
 
-    /// Starts the map with two frames that show one scene from two places.
+    /// Starts a submap with two frames that show one scene from two places.
     pub(super) fn start_without_depth(
         &mut self,
         frame: &Frame,
         features: Arc<FrameFeatures>,
         may: bool,
         times: StageTimes,
-    ) -> TrackedFrame {
+    ) -> Result<TrackedFrame, TrackingError> {
         if !may {
-            return TrackedFrame::lost(times);
+            return Ok(TrackedFrame::lost(times));
         }
         let matches = self.first_view.as_mut().and_then(|first| first.follow(&features, &self.rig.pinhole));
         let (Some(first), Some(matches)) = (&self.first_view, matches) else {
             self.first_view = Some(FirstView::new(frame.index, frame.timestamp_s, features));
-            return TrackedFrame::lost(times);
+            return Ok(TrackedFrame::lost(times));
         };
         let second = SecondView { frame_index: frame.index, timestamp_s: frame.timestamp_s, features: &features };
-        let Some(map) = mono::first_map(first, &second, &matches, &self.rig) else { return TrackedFrame::lost(times) };
-        self.map = map;
-        self.first_view = None;
-        let keyframes = self.keyframes();
-        let [first, second] = &keyframes[..] else { return TrackedFrame::lost(times) };
-        for keyframe in [first, second] {
-            let (frame_index, timestamp_s, reference) = (keyframe.frame_index, keyframe.timestamp_s, keyframe.id);
+        let Some(submap) = mono::first_map(first, &second, &matches, &self.rig) else { return Ok(TrackedFrame::lost(times)) };
+        let (first, second) = (self.map.keyframes.len(), self.map.keyframes.len() + 1);
+        self.map.append(submap, &self.next_submap(), &self.rig.config);
+        for reference in [first, second] {
+            let Keyframe { frame_index, timestamp_s, .. } = self.map.keyframes[reference];
             self.records.push(Record { frame_index, timestamp_s, reference, camera_from_reference: Se3::identity() });
         }
-        let (id, world_from_camera) = (second.id, second.world_from_camera);
-        self.motion.reference = id;
-        let landmarks = self.map.keyframes[id].landmarks.clone();
-        let inliers = landmarks.iter().flatten().count();
-        self.motion.last = Some(LastFrame { features, camera_from_world: world_from_camera.inverse(), landmarks });
-        TrackedFrame {
-            state: TrackingState::Tracking,
-            world_from_camera: Some(world_from_camera),
-            inliers,
-            keyframe: Some(self.describe(id)),
-            updates: Vec::new(),
-            times,
-        }
+        let Keyframe { camera_from_world, ref landmarks, .. } = self.map.keyframes[second];
+        let (inliers, landmarks) = (landmarks.iter().flatten().count(), landmarks.clone());
+        let started = self.started(LastFrame { features, camera_from_world, landmarks }, second, times);
+        Ok(TrackedFrame { inliers, ..started })
+    }
+
+    /// The frame that completes a start, which is keyframe `id`.
+    fn started(&mut self, last: LastFrame, id: usize, times: StageTimes) -> TrackedFrame {
+        let world_from_camera = Some(last.camera_from_world.inverse());
+        self.first_view = None;
+        self.motion = Motion { last: Some(last), velocity: None, reference: id };
+        let frames_since_found = if self.lostness.is_lost { 0 } else { self.lostness.frames_since_found };
+        self.lostness = Lostness { is_lost: false, frames_lost: 0, frames_since_found };
+        let keyframe = Some(self.describe(id));
+        TrackedFrame { state: TrackingState::Tracking, world_from_camera, inliers: 0, keyframe, updates: Vec::new(), times }
     }
 }
