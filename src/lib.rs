@@ -11,6 +11,7 @@ pub mod export;
 pub mod files;
 pub mod geometry;
 pub mod gpu;
+pub mod inspection;
 pub mod mapping;
 pub mod optimise;
 pub mod pipeline;

@@ -2,6 +2,7 @@
 
 mod adapters;
 mod bench;
+mod check;
 mod demo;
 mod eval;
 mod generate;
@@ -42,6 +43,8 @@ enum LogFormat {
 
 #[derive(Subcommand)]
 enum Command {
+    /// Say what a recording holds and what in it looks wrong, before a run.
+    Check(check::CheckArgs),
     /// Replay a recording into a trajectory and a map.
     Run(run::RunArgs),
     /// Go on with a run that was interrupted and kept checkpoints.
@@ -93,6 +96,7 @@ pub fn main() -> ExitCode {
 
 fn execute(command: Command, verbosity: Verbosity) -> miette::Result<()> {
     match command {
+        Command::Check(args) => check::check(&args, verbosity),
         Command::Run(args) => run::run(&args, verbosity),
         Command::Resume(args) => resume::resume(&args, verbosity),
         Command::Demo(args) => demo::demo(&args, verbosity),

@@ -9,13 +9,14 @@ use std::path::{Path, PathBuf};
 const EVERYTHING_ABOVE: &[&str] = &["*"];
 
 /// A module, and the modules whose items it may name. `verification` is in no list but the command line's: production does not use the oracle.
-const ALLOWED: [(&str, &[&str]); 22] = [
+const ALLOWED: [(&str, &[&str]); 23] = [
     ("files", &[]),
     ("geometry", &[]),
     ("sequence", &["geometry"]),
     ("synthetic", &["geometry"]),
     ("splat", &["geometry"]),
     ("tracking", &["geometry", "sequence"]),
+    ("inspection", &["geometry", "sequence", "tracking"]),
     ("gpu", &[]),
     ("render", &["geometry", "splat", "gpu"]),
     ("optimise", &["geometry", "splat", "gpu", "render"]),

@@ -4,6 +4,7 @@
 mod common;
 
 mod bad_input;
+mod check;
 mod end_to_end;
 mod faults;
 mod interaction;
