@@ -64,8 +64,7 @@ fn doubts(camera: &Camera) -> Vec<String> {
     let folds = corners.iter().any(|(x, y)| {
         let corner = Vector2::new(*x, *y);
         let off = (camera.distort_pixel(&camera.undistort_pixel(&corner)) - corner).norm();
-        // NaN folds.
-        !(off < FOLDED_PIXELS)
+        off.is_nan() || off > FOLDED_PIXELS
     });
     if folds {
         doubts.push(

@@ -167,8 +167,8 @@ impl Tracker {
         self.take_adjusted(&mut times)?;
         let mut tracked = match self.motion.last.take() {
             Some(last) => self.go_on(frame, features, dense.as_deref(), last, may_be_keyframe, times)?,
-            None if self.front_end.sensor == Sensor::Mono => self.start_without_depth(frame, features, may_be_keyframe, times)?,
-            None => self.start(frame, features, may_be_keyframe, times)?,
+            None if self.front_end.sensor == Sensor::Mono => self.start_without_depth(frame, features, may_be_keyframe, times),
+            None => self.start(frame, features, may_be_keyframe, times),
         };
         if tracked.state == TrackingState::Tracking {
             self.keep_dense(dense, tracked.keyframe.is_some());

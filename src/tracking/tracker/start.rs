@@ -10,20 +10,14 @@ use crate::tracking::initialisation::mono::{self, FirstView, SecondView};
 use crate::tracking::localisation::localise::LastFrame;
 use crate::tracking::map::insertion;
 use crate::tracking::map::sparse_map::Keyframe;
-use crate::tracking::{StageTimes, TrackedFrame, TrackingError, TrackingState};
+use crate::tracking::{StageTimes, TrackedFrame, TrackingState};
 
 impl Tracker {
     /// Starts a submap with a frame that shows enough.
-    pub(super) fn start(
-        &mut self,
-        frame: &Frame,
-        features: Arc<FrameFeatures>,
-        may: bool,
-        times: StageTimes,
-    ) -> Result<TrackedFrame, TrackingError> {
+    pub(super) fn start(&mut self, frame: &Frame, features: Arc<FrameFeatures>, may: bool, times: StageTimes) -> TrackedFrame {
         let with_depth = features.features.iter().filter(|f| f.depth_metres.is_some()).count();
         if !may || with_depth < self.rig.config.min_initial_landmarks {
-            return Ok(TrackedFrame::lost(times));
+            return TrackedFrame::lost(times);
         }
         let camera_from_world = self.next_submap().inverse();
         let keyframe = Keyframe {
@@ -38,7 +32,7 @@ impl Tracker {
         let landmarks = self.map.keyframes[id].landmarks.clone();
         self.record(frame, id, Se3::identity());
         let started = self.started(LastFrame { features, camera_from_world, landmarks }, id, times);
-        Ok(TrackedFrame { inliers: with_depth, ..started })
+        TrackedFrame { inliers: with_depth, ..started }
     }
 
     /// Starts a submap with two frames that show one scene from two places.
@@ -48,17 +42,17 @@ impl Tracker {
         features: Arc<FrameFeatures>,
         may: bool,
         times: StageTimes,
-    ) -> Result<TrackedFrame, TrackingError> {
+    ) -> TrackedFrame {
         if !may {
-            return Ok(TrackedFrame::lost(times));
+            return TrackedFrame::lost(times);
         }
         let matches = self.first_view.as_mut().and_then(|first| first.follow(&features, &self.rig.pinhole));
         let (Some(first), Some(matches)) = (&self.first_view, matches) else {
             self.first_view = Some(FirstView::new(frame.index, frame.timestamp_s, features));
-            return Ok(TrackedFrame::lost(times));
+            return TrackedFrame::lost(times);
         };
         let second = SecondView { frame_index: frame.index, timestamp_s: frame.timestamp_s, features: &features };
-        let Some(submap) = mono::first_map(first, &second, &matches, &self.rig) else { return Ok(TrackedFrame::lost(times)) };
+        let Some(submap) = mono::first_map(first, &second, &matches, &self.rig) else { return TrackedFrame::lost(times) };
         let (first, second) = (self.map.keyframes.len(), self.map.keyframes.len() + 1);
         self.map.append(submap, &self.next_submap(), &self.rig.config);
         for reference in [first, second] {
@@ -68,7 +62,7 @@ impl Tracker {
         let Keyframe { camera_from_world, ref landmarks, .. } = self.map.keyframes[second];
         let (inliers, landmarks) = (landmarks.iter().flatten().count(), landmarks.clone());
         let started = self.started(LastFrame { features, camera_from_world, landmarks }, second, times);
-        Ok(TrackedFrame { inliers, ..started })
+        TrackedFrame { inliers, ..started }
     }
 
     /// The frame that completes a start, which is keyframe `id`.

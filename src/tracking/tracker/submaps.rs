@@ -44,10 +44,10 @@ impl Tracker {
             return Ok(TrackedFrame::lost(times));
         }
         self.finish_adjustment_before_keyframe(&mut times)?;
-        match self.front_end.sensor {
+        Ok(match self.front_end.sensor {
             Sensor::Mono => self.start_without_depth(frame, features, may_be_keyframe, times),
             _ => self.start(frame, features, may_be_keyframe, times),
-        }
+        })
     }
 
     /// world_from_submap of the next submap: the first is the world.
