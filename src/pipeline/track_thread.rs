@@ -243,7 +243,8 @@ mod tests {
         let Ok(MapperMessage::Keyframe(sent)) = messages.try_recv() else { panic!("the keyframe that waited") };
         assert_eq!((sent.id, sent.world_from_camera), (3, moved(3, 4.0, 1.0).world_from_camera));
         assert!(sent.image.depth.unwrap().metres.iter().all(|metres| *metres == 2.5), "its depth is in the new scale");
-        assert_eq!(channel.finish(Vec::new(), Vec::new()), 1, "keyframe 2 was replaced");
+        assert_eq!(channel.finish(Vec::new(), vec![5]), 1, "keyframe 2 was replaced");
+        assert!(matches!(messages.try_recv(), Ok(MapperMessage::Remove(keyframes)) if keyframes == [5]));
         drop(messages);
         assert!(!KeyframeSender::new(&sender, true).send(keyframe(4)));
     }
@@ -255,7 +256,7 @@ mod tests {
         [0, 1, 2].into_iter().for_each(|id| assert!(channel.send(keyframe(id))));
         assert!(channel.send(MapperMessage::PoseUpdate(vec![moved(0, 1.0, 2.0), moved(2, 1.0, 2.0)])));
         messages.iter().take(2).for_each(drop);
-        assert_eq!(channel.finish(vec![moved(0, 3.0, 1.5), moved(1, 2.0, 1.0), moved(2, 5.0, 1.5)], vec![1]), 0);
+        assert_eq!(channel.finish(vec![moved(0, 3.0, 1.5), moved(1, 2.0, 1.0), moved(2, 5.0, 1.5)], Vec::new()), 0);
         let Ok(MapperMessage::PoseUpdate(poses)) = messages.try_recv() else { panic!("poses come before the keyframe") };
         assert_eq!(poses, [moved(0, 3.0, 3.0), moved(1, 2.0, 1.0)]);
         let Ok(MapperMessage::Keyframe(last)) = messages.try_recv() else { panic!("the keyframe that waited") };
