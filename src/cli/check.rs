@@ -4,29 +4,24 @@ use std::path::PathBuf;
 
 use clap::Args;
 use keysplat::inspection::inspect;
-use keysplat::sequence::{Layout, SensorKind, Sequence};
+use keysplat::sequence::Sequence;
 use miette::{IntoDiagnostic, miette};
 
+use super::source::SourceArgs;
 use super::{Verbosity, print};
 
 #[derive(Args)]
 pub struct CheckArgs {
     /// Folder of the recording, or a video.
     sequence: PathBuf,
-    /// Dataset layout, where it is not recognised.
-    #[arg(long, value_enum)]
-    layout: Option<Layout>,
-    /// Use of the recording only what a sensor of this kind gives.
-    #[arg(long, value_enum)]
-    sensor: Option<SensorKind>,
-    /// Camera preset to use instead of the recording's own calibration; for a video, or the path of a camera.toml.
-    #[arg(long)]
-    camera: Option<String>,
+    #[command(flatten)]
+    source: SourceArgs,
 }
 
 pub fn check(args: &CheckArgs, verbosity: Verbosity) -> miette::Result<()> {
-    let mut sequence = Sequence::open(&args.sequence, args.layout, args.camera.as_deref()).into_diagnostic()?;
-    if let Some(kind) = args.sensor {
+    let SourceArgs { layout, sensor, camera } = &args.source;
+    let mut sequence = Sequence::open(&args.sequence, *layout, camera.as_deref()).into_diagnostic()?;
+    if let Some(kind) = *sensor {
         sequence.restrict_to(kind).into_diagnostic()?;
     }
     let found = inspect(&sequence).into_diagnostic()?;
@@ -37,10 +32,7 @@ pub fn check(args: &CheckArgs, verbosity: Verbosity) -> miette::Result<()> {
     }
     match found.problems() {
         0 => Ok(()),
-        n => Err(miette!(
-            "{n} {} {} a run useless",
-            if n == 1 { "problem" } else { "problems" },
-            if n == 1 { "makes" } else { "make" }
-        )),
+        1 => Err(miette!("1 problem makes a run useless")),
+        n => Err(miette!("{n} problems make a run useless")),
     }
 }

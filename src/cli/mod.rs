@@ -10,6 +10,7 @@ mod progress;
 mod report;
 mod resume;
 mod run;
+mod source;
 mod stress;
 
 use std::io::{ErrorKind, IsTerminal, Write};

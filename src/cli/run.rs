@@ -10,10 +10,11 @@ use indicatif::ProgressBar;
 use keysplat::config::SequenceConfig;
 use keysplat::export::MapFormat;
 use keysplat::presets::{self, Preset};
-use keysplat::sequence::{Layout, SensorKind, is_camera_file};
+use keysplat::sequence::is_camera_file;
 use keysplat::{Config, Gpu, Progress, Recording, Session, SessionError};
 use miette::{IntoDiagnostic, miette};
 
+use super::source::SourceArgs;
 use super::{Verbosity, print_metrics, progress};
 
 #[derive(Args)]
@@ -26,15 +27,8 @@ pub struct RunArgs {
     /// Configuration (TOML); options on the command line go before it.
     #[arg(short, long)]
     config: Option<PathBuf>,
-    /// Layout of the recording, where it isn't recognised.
-    #[arg(long, value_enum)]
-    layout: Option<Layout>,
-    /// Use of the recording only what a sensor of this kind gives.
-    #[arg(long, value_enum)]
-    sensor: Option<SensorKind>,
-    /// Camera preset to use instead of the recording's own calibration; for a video, or the path of a camera.toml.
-    #[arg(long)]
-    camera: Option<String>,
+    #[command(flatten)]
+    source: SourceArgs,
     /// Mapping resolution as a share of the recorded one, e.g. 0.5. Without it and without --config it follows from the kind of adapter.
     #[arg(long)]
     map_scale: Option<f64>,
@@ -144,9 +138,9 @@ impl RunArgs {
             .sequence
             .as_mut()
             .ok_or_else(|| miette!("which recording? Give its folder or video: keysplat run <SEQUENCE> --out <DIR>"))?;
-        sequence.layout = self.layout.or(sequence.layout);
-        sequence.sensor = self.sensor.or(sequence.sensor);
-        if let Some(camera) = &self.camera {
+        sequence.layout = self.source.layout.or(sequence.layout);
+        sequence.sensor = self.source.sensor.or(sequence.sensor);
+        if let Some(camera) = &self.source.camera {
             sequence.camera = Some(if is_camera_file(camera) { absolute(camera)? } else { camera.clone() });
         }
         config.map_scale = self.map_scale.or(scale).unwrap_or(config.map_scale);

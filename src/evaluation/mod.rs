@@ -16,4 +16,4 @@ pub use drawing::draw_trajectory;
 pub use exposures::{ExposureRecord, Exposures};
 pub use image::{ImageError, ImageF32, depth_l1, psnr, psnr_where_lit, ssim};
 pub use metrics::{Metrics, Times, sha256_hex, write_json};
-pub use trajectory::{Alignment, AlignmentError, TrajectoryErrors, evaluate_trajectory};
+pub use trajectory::{Alignment, AlignmentError, MAX_TIME_DIFFERENCE_S, TrajectoryErrors, evaluate_trajectory};

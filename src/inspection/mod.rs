@@ -11,7 +11,8 @@ use std::fmt;
 
 use serde::Serialize;
 
-use crate::sequence::{Sensor, Sequence};
+use crate::evaluation::MAX_TIME_DIFFERENCE_S;
+use crate::sequence::{FrameEntry, Sensor, Sequence};
 use crate::tracking::{TrackingConfig, TrackingError};
 
 /// How much a finding matters.
@@ -110,16 +111,12 @@ fn truth(sequence: &Sequence, found: &mut Inspection) {
         found.fact("true poses", "none, so there will be no ATE".into());
         return;
     };
-    let near = |time_s: f64| {
-        let after = truth.poses.partition_point(|pose| pose.timestamp_s < time_s);
-        let around = [after.checked_sub(1), Some(after)].into_iter().flatten().filter_map(|k| truth.poses.get(k));
-        around.map(|pose| (pose.timestamp_s - time_s).abs()).fold(f64::INFINITY, f64::min)
-    };
-    let matched = sequence.entries.iter().filter(|entry| near(entry.timestamp_s) <= timestamps::SAME_TIME_S).count();
     if sequence.layout.is_photos() {
         found.fact("poses", format!("{}, known: map with --known-poses", truth.poses.len()));
         return;
     }
+    let has_pose = |entry: &&FrameEntry| truth.nearest(entry.timestamp_s, MAX_TIME_DIFFERENCE_S).is_some();
+    let matched = sequence.entries.iter().filter(has_pose).count();
     found.fact("true poses", format!("{}, at the time of {matched} of {} frames", truth.poses.len(), sequence.entries.len()));
     if matched == 0 {
         found.warn("no true pose has the time of a frame: the two have different clocks, and there will be no ATE".into());

@@ -3,8 +3,6 @@
 use super::{Inspection, quantile};
 use crate::sequence::Sequence;
 
-/// Times that differ by no more than this are the same, as in the evaluation of trajectories.
-pub const SAME_TIME_S: f64 = 0.02;
 /// An interval of so many usual ones is a gap, if it is long enough to lose the camera.
 const GAP_INTERVALS: f64 = 5.0;
 const GAP_S: f64 = 0.5;

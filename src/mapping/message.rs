@@ -15,7 +15,7 @@ pub enum MapperMessage {
     Keyframe(Box<Keyframe>),
     /// New poses of earlier keyframes after bundle adjustment or a loop closure.
     PoseUpdate(Vec<PoseUpdate>),
-    /// Keyframes whose place in the world never became known, at the end.
+    /// Keyframes of submaps that never joined the largest one, after the last frame.
     Remove(Vec<KeyframeId>),
 }
 

@@ -87,9 +87,9 @@ impl<'a> KeyframeSender<'a> {
         true
     }
 
-    /// Sends all that waits, the final poses, and the keyframes without a place in the world; returns the number of keyframes that the mapper
+    /// Sends all that waits, the final poses, and the keyframes of submaps that never joined; returns the number of keyframes that the mapper
     /// never received. No newer keyframe replaces the one that waits.
-    pub fn finish(mut self, last: Vec<PoseUpdate>, placeless: Vec<KeyframeId>) -> usize {
+    pub fn finish(mut self, last: Vec<PoseUpdate>, unjoined: Vec<KeyframeId>) -> usize {
         self.add_poses(last);
         if !self.waiting_poses.is_empty() {
             let _ = self.sender.send(MapperMessage::PoseUpdate(self.waiting_poses.into_values().collect()));
@@ -97,8 +97,8 @@ impl<'a> KeyframeSender<'a> {
         if let Some(keyframe) = self.waiting {
             let _ = self.sender.send(MapperMessage::Keyframe(keyframe));
         }
-        if !placeless.is_empty() {
-            let _ = self.sender.send(MapperMessage::Remove(placeless));
+        if !unjoined.is_empty() {
+            let _ = self.sender.send(MapperMessage::Remove(unjoined));
         }
         self.deferred
     }
@@ -148,10 +148,10 @@ impl TrackThread<'_> {
         });
         summary.trajectory = tracker.trajectory();
         summary.keyframes = tracker.keyframes();
-        let placeless = tracker.apart();
-        if !placeless.is_empty() {
+        let unjoined = tracker.unjoined_keyframes();
+        if !unjoined.is_empty() {
             tracing::warn!(
-                keyframes = placeless.len(),
+                keyframes = unjoined.len(),
                 "the camera was lost and began a submap whose place in the map was never recognised: its frames count as lost"
             );
         }
@@ -160,7 +160,7 @@ impl TrackThread<'_> {
             scale: scales.get(&k.id).copied().unwrap_or(1.0),
             ..PoseUpdate::rigid(k.id, k.world_from_camera)
         };
-        summary.deferred = keyframes.finish(summary.keyframes.iter().map(last).collect(), placeless);
+        summary.deferred = keyframes.finish(summary.keyframes.iter().map(last).collect(), unjoined);
         summary
     }
 

@@ -9,7 +9,7 @@ const FEATURES_WITH_DEPTH_IMAGES: usize = 2000;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TrackingConfig {
-    /// Features kept per frame, over all pyramid levels. By default 2000 with depth images and 1000 without, where more of them are weaker landmarks.
+    /// Features kept per frame, over all pyramid levels; by default 2000 with depth images and 1000 without.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub features: Option<usize>,
     /// Levels of the image pyramid.

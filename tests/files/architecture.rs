@@ -16,7 +16,7 @@ const ALLOWED: [(&str, &[&str]); 23] = [
     ("synthetic", &["geometry"]),
     ("splat", &["geometry"]),
     ("tracking", &["geometry", "sequence"]),
-    ("inspection", &["geometry", "sequence", "tracking"]),
+    ("inspection", &["geometry", "sequence", "tracking", "evaluation"]),
     ("gpu", &[]),
     ("render", &["geometry", "splat", "gpu"]),
     ("optimise", &["geometry", "splat", "gpu", "render"]),

@@ -250,10 +250,10 @@ fn a_lost_camera_begins_a_submap_that_joins_when_a_place_is_recognised() {
     };
     let apart = run(52);
     assert_eq!(apart.trajectory().iter().map(|(i, _)| *i).collect::<Vec<_>>(), (0..20).collect::<Vec<_>>());
-    assert_eq!(apart.keyframes().len() + apart.apart().len(), apart.keyframe_count());
-    assert!(!apart.apart().is_empty());
+    assert_eq!(apart.keyframes().len() + apart.unjoined_keyframes().len(), apart.keyframe_count());
+    assert!(!apart.unjoined_keyframes().is_empty());
     let joined = run(72);
-    assert!(joined.apart().is_empty());
+    assert!(joined.unjoined_keyframes().is_empty());
     let trajectory = joined.trajectory();
     assert_eq!(trajectory.len(), 20 + 27);
     for (i, pose) in trajectory {

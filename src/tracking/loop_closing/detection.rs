@@ -112,6 +112,9 @@ impl Search<'_> {
         let landmarks = self.map.landmarks_of(&around);
         let rough = aligned * Sim3::from(self.map.keyframes[place].camera_from_world);
         let seen = self.search_in(&landmarks, keyframe, &rough.to_rigid());
+        if seen.matches.len() < MIN_INLIERS_EACH {
+            return None;
+        }
         let current = self.map.keyframes[keyframe].camera_from_world;
         let in_neighbour = |neighbour: &usize| {
             let neighbour_from_keyframe = self.map.keyframes[*neighbour].camera_from_world * current.inverse();

@@ -1,9 +1,11 @@
-//! RGB-D frames whose features do not give a pose: all pixels do, for a while. A false minimum looks like a pose after a gap.
+//! RGB-D frames whose features do not give a pose: all pixels do, for a while. Not across a gap, where a false
+//! minimum looks like a pose.
 
 use std::sync::Arc;
 
 use super::Tracker;
 use crate::geometry::Se3;
+use crate::sequence::Frame;
 use crate::tracking::features::frame_features::FrameFeatures;
 use crate::tracking::localisation::dense_alignment::{DenseFrame, align};
 use crate::tracking::localisation::localise::LastFrame;
@@ -40,6 +42,15 @@ impl Tracker {
         }
         let mut context = Context { map: &mut self.map, rig: &self.rig };
         Some(context.at_pose(features, camera_from_world, self.motion.reference))
+    }
+
+    /// How many frames are missing between the last one and this, going by the interval before.
+    pub(super) fn missing_before(&mut self, frame: &Frame) -> usize {
+        let interval_s = self.arrival.map(|(last_s, _)| (frame.timestamp_s - last_s).abs());
+        let usual_s = self.arrival.and_then(|(_, usual_s)| usual_s).filter(|usual_s| *usual_s > 0.0);
+        self.arrival = Some((frame.timestamp_s, interval_s));
+        let intervals = interval_s.zip(usual_s).map_or(1.0, |(interval_s, usual_s)| (interval_s / usual_s).round());
+        (intervals as usize).saturating_sub(1)
     }
 
     /// Keeps a tracked frame's pixels for the next.

@@ -19,15 +19,6 @@ const LOST_AFTER_S: f64 = 1.0;
 const APART_DEPTHS: f64 = 100.0;
 
 impl Tracker {
-    /// How many frames are missing between the last one and this, going by the interval before.
-    pub(super) fn missing_before(&mut self, frame: &Frame) -> usize {
-        let interval_s = self.arrival.map(|(last_s, _)| (frame.timestamp_s - last_s).abs());
-        let usual_s = self.arrival.and_then(|(_, usual_s)| usual_s).filter(|usual_s| *usual_s > 0.0);
-        self.arrival = Some((frame.timestamp_s, interval_s));
-        let intervals = interval_s.zip(usual_s).map_or(1.0, |(interval_s, usual_s)| (interval_s / usual_s).round());
-        (intervals as usize).saturating_sub(1)
-    }
-
     /// A frame without a pose: after a while it begins a new submap.
     pub(super) fn lose(
         &mut self,
@@ -59,7 +50,7 @@ impl Tracker {
     }
 
     /// Keyframes of submaps that did not join the largest one.
-    pub fn apart(&self) -> Vec<usize> {
+    pub fn unjoined_keyframes(&self) -> Vec<usize> {
         let largest = self.largest_submap();
         (0..self.map.keyframes.len()).filter(|k| self.map.keyframes[*k].root != largest).collect()
     }
