@@ -4,6 +4,7 @@ mod ablation;
 mod host;
 mod sweep;
 mod track;
+mod walk;
 
 use std::path::{Path, PathBuf};
 
@@ -39,6 +40,8 @@ enum What {
     Sweep(sweep::SweepArgs),
     /// The tracker on many replays of recordings: start frames, directions, missing frames; distributions of its errors.
     Track(track::TrackArgs),
+    /// The tracker on simulated walks of any length: time a frame, memory, loops, errors.
+    Walk(walk::WalkArgs),
     /// Changes between two sweeps.
     Compare(sweep::CompareArgs),
 }
@@ -115,6 +118,7 @@ pub fn bench(args: &BenchArgs, verbosity: Verbosity) -> miette::Result<()> {
         What::Ablation(args) => ablation::ablation(args),
         What::Sweep(args) => sweep::sweep(args, verbosity),
         What::Track(args) => track::track(args, verbosity),
+        What::Walk(args) => walk::walk(args, verbosity),
         What::Compare(args) => sweep::compare(args),
     }
 }

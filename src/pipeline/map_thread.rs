@@ -8,12 +8,12 @@ use std::time::{Duration, Instant};
 use crossbeam::channel::Receiver;
 
 use super::progress::guarded;
+use super::read_thread::QueuedFrame;
 use super::{PipelineError, Progress};
 use crate::evaluation::machine;
 use crate::gpu::Gpu;
 use crate::mapping::{FinalRefinement, KeyframeId, KeyframeReport, Mapper, MapperMessage, MappingConfig, MappingError};
 use crate::run_folder::{CheckpointError, Checkpointer, KeyframeRecord, RunState};
-use crate::sequence::Frame;
 use crate::splat::{Exposure, GaussianCloud, MapSnapshot};
 
 /// Real time: the mapper pauses between two batches of steps while more frames than this wait for the tracker,
@@ -48,7 +48,7 @@ pub(super) struct MapThread<'a> {
     pub config: &'a MappingConfig,
     pub messages: &'a Receiver<MapperMessage>,
     /// Real time: frames that wait for the tracker.
-    pub frames: Option<&'a Receiver<Frame>>,
+    pub frames: Option<&'a Receiver<QueuedFrame>>,
     pub progress: &'a Progress,
 }
 
@@ -263,7 +263,7 @@ impl Inbox<'_> {
 }
 
 /// Yields the processor while frames wait for the tracker, at most [`LONGEST_PAUSE`]: a tracker that stays behind needs a map all the same.
-fn wait_for_tracker(frames: &Receiver<Frame>) {
+fn wait_for_tracker(frames: &Receiver<QueuedFrame>) {
     let began = Instant::now();
     while frames.len() > MOST_WAITING && began.elapsed() < LONGEST_PAUSE {
         std::thread::sleep(Duration::from_millis(1));

@@ -1,11 +1,24 @@
-//! Decodes frames ahead of the tracker and keeps the replay's clock.
+//! Decodes frames and extracts their features ahead of the tracker, and keeps the replay's clock.
 
 use std::time::{Duration, Instant};
 
 use crossbeam::channel::{Sender, TrySendError};
 
 use super::Progress;
+use crate::recording::Recording;
 use crate::sequence::{Frame, Sequence};
+use crate::tracking::{ExtractedFrame, FrontEnd, TrackingError};
+
+/// Frames decoded and extracted at the same time, at most: as many as there are processors, up to this.
+const MOST_AT_ONCE: usize = 8;
+
+/// A frame on its way to the tracking thread.
+#[derive(Debug)]
+pub(super) struct QueuedFrame {
+    pub frame: Frame,
+    /// `None` where poses are known.
+    pub extracted: Option<Result<ExtractedFrame, TrackingError>>,
+}
 
 /// Result of the reading thread.
 #[derive(Clone, Debug, Default)]
@@ -16,37 +29,56 @@ pub(super) struct ReadSummary {
     pub late: usize,
 }
 
-/// Sends every readable frame, in order. Real-time replay waits for each frame's timestamp and never blocks on the tracker.
-pub(super) fn read(sequence: &Sequence, real_time: bool, sender: &Sender<Frame>, progress: &Progress) -> ReadSummary {
-    let mut summary = ReadSummary::default();
-    let started = Instant::now();
-    let first_s = sequence.entries.first().map_or(0.0, |entry| entry.timestamp_s);
-    for index in 0..sequence.entries.len() {
-        if progress.stopped() {
-            break;
-        }
-        let frame = match sequence.load(index) {
-            Ok(frame) => frame,
-            Err(error) => {
-                tracing::warn!(frame = index, "skipped, it cannot be read: {error}");
-                summary.read_failed += 1;
-                summary.first_failure.get_or_insert_with(|| error.to_string());
-                continue;
-            }
-        };
-        if real_time {
-            let due = Duration::try_from_secs_f64(frame.timestamp_s - first_s).unwrap_or_default();
-            std::thread::sleep(due.saturating_sub(started.elapsed()));
-            match sender.try_send(frame) {
-                Ok(()) => {}
-                Err(TrySendError::Full(_)) => summary.late += 1,
-                Err(TrySendError::Disconnected(_)) => break,
-            }
-        } else if sender.send(frame).is_err() {
-            break;
-        }
+/// Input of the reading thread.
+pub(super) struct ReadThread<'a> {
+    sequence: &'a Sequence,
+    front_end: Option<FrontEnd>,
+    real_time: bool,
+    sender: &'a Sender<QueuedFrame>,
+    progress: &'a Progress,
+}
+
+impl<'a> ReadThread<'a> {
+    /// The frames of a recording, with features unless its poses are known.
+    pub fn new(recording: &'a Recording, sender: &'a Sender<QueuedFrame>, progress: &'a Progress) -> Self {
+        let (sequence, config) = (recording.sequence(), recording.config());
+        let front_end = || FrontEnd::new(sequence.camera, sequence.sensor, &config.tracking);
+        let front_end = (!config.replay.known_poses).then(front_end);
+        Self { sequence, front_end, real_time: config.replay.real_time, sender, progress }
     }
-    summary
+
+    /// Sends every readable frame, in order. Real-time replay waits for each frame's timestamp and never blocks on the tracker.
+    pub fn read(&self) -> ReadSummary {
+        let mut summary = ReadSummary::default();
+        let started = Instant::now();
+        let first_s = self.sequence.entries.first().map_or(0.0, |entry| entry.timestamp_s);
+        let prepare = |frame: Frame| QueuedFrame { extracted: self.front_end.as_ref().map(|f| f.extract(&frame)), frame };
+        let ahead = rayon::current_num_threads().min(MOST_AT_ONCE);
+        self.sequence.read_ahead(0..self.sequence.entries.len(), ahead, prepare, |index, loaded| {
+            let queued = match loaded {
+                Ok(queued) => queued,
+                Err(error) => {
+                    tracing::warn!(frame = index, "skipped, it cannot be read: {error}");
+                    summary.read_failed += 1;
+                    summary.first_failure.get_or_insert_with(|| error.to_string());
+                    return !self.progress.stopped();
+                }
+            };
+            if self.real_time {
+                let due = Duration::try_from_secs_f64(queued.frame.timestamp_s - first_s).unwrap_or_default();
+                std::thread::sleep(due.saturating_sub(started.elapsed()));
+                match self.sender.try_send(queued) {
+                    Ok(()) => {}
+                    Err(TrySendError::Full(_)) => summary.late += 1,
+                    Err(TrySendError::Disconnected(_)) => return false,
+                }
+            } else if self.sender.send(queued).is_err() {
+                return false;
+            }
+            !self.progress.stopped()
+        });
+        summary
+    }
 }
 
 #[cfg(test)]
@@ -55,6 +87,7 @@ mod tests {
 
     use super::*;
     use crate::synthetic::{self, CameraConfig, SceneConfig};
+    use crate::tracking::TrackingConfig;
 
     const FRAMES: usize = 5;
     const CAPACITY: usize = 2;
@@ -69,13 +102,23 @@ mod tests {
         (folder, sequence)
     }
 
+    fn thread<'a>(
+        sequence: &'a Sequence,
+        real_time: bool,
+        sender: &'a Sender<QueuedFrame>,
+        progress: &'a Progress,
+    ) -> ReadThread<'a> {
+        let front_end = Some(FrontEnd::new(sequence.camera, sequence.sensor, &TrackingConfig::default()));
+        ReadThread { sequence, front_end, real_time, sender, progress }
+    }
+
     #[test]
     fn in_real_time_frames_that_find_the_channel_full_are_dropped_and_counted() {
         let (_folder, sequence) = sequence();
         let (sender, frames) = bounded(CAPACITY);
-        let summary = read(&sequence, true, &sender, &Progress::default());
+        let summary = thread(&sequence, true, &sender, &Progress::default()).read();
         assert_eq!((summary.late, summary.read_failed), (FRAMES - CAPACITY, 0));
-        assert_eq!(frames.try_iter().map(|frame| frame.index).collect::<Vec<_>>(), [0, 1]);
+        assert_eq!(frames.try_iter().map(|queued| queued.frame.index).collect::<Vec<_>>(), [0, 1]);
     }
 
     #[test]
@@ -84,7 +127,7 @@ mod tests {
         let (sender, frames) = bounded(CAPACITY);
         let (summary, read) = std::thread::scope(|scope| {
             let consumer = scope.spawn(|| frames.iter().count());
-            let summary = read(&sequence, false, &sender, &Progress::default());
+            let summary = thread(&sequence, false, &sender, &Progress::default()).read();
             drop(sender);
             (summary, consumer.join().unwrap())
         });

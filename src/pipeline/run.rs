@@ -9,7 +9,7 @@ use crossbeam::channel::bounded;
 use super::known_poses::{self, Scene};
 use super::map_thread::{MapSummary, MapThread};
 use super::progress::guarded;
-use super::read_thread::{self, ReadSummary};
+use super::read_thread::{ReadSummary, ReadThread};
 use super::track_thread::{TrackSummary, TrackThread};
 use super::{PipelineError, Progress};
 use crate::gpu::Gpu;
@@ -71,7 +71,7 @@ pub fn run(
             .map_err(spawn_error("tracking"))?;
         let read = Builder::new()
             .name("reading".into())
-            .spawn_scoped(scope, move || read_thread::read(recording.sequence(), real_time, &frame_sender, progress))
+            .spawn_scoped(scope, move || ReadThread::new(recording, &frame_sender, progress).read())
             .map_err(spawn_error("reading"))?;
         Ok::<_, PipelineError>((join("reading", read), join("tracking", track), join("mapping", map)))
     })?;

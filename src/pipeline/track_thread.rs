@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use crossbeam::channel::{Receiver, Sender, TrySendError};
 
 use super::progress::{TrackingProgress, guarded};
+use super::read_thread::QueuedFrame;
 use super::{PipelineError, Progress};
 use crate::geometry::{StampedPose, Trajectory};
 use crate::mapping::{DepthSource, Keyframe, KeyframeId, MapperMessage, PoseUpdate, RightImage};
@@ -108,7 +109,7 @@ impl<'a> KeyframeSender<'a> {
 #[derive(Clone, Copy)]
 pub(super) struct TrackThread<'a> {
     pub recording: &'a Recording,
-    pub frames: &'a Receiver<Frame>,
+    pub frames: &'a Receiver<QueuedFrame>,
     pub mapper: &'a Sender<MapperMessage>,
     pub progress: &'a Progress,
 }
@@ -124,9 +125,10 @@ impl TrackThread<'_> {
         };
         let rectifier = Rectifier::new(&sequence.camera, config.map_scale);
         let mut keyframes = KeyframeSender::new(self.mapper, config.replay.real_time);
-        for frame in self.frames {
+        for QueuedFrame { frame, extracted } in self.frames {
+            let Some(extracted) = extracted else { continue };
             let may_be_keyframe = !config.replay.is_held_out(frame.index);
-            let tracked = match guarded("tracking", || Ok(tracker.track(&frame, may_be_keyframe)?)) {
+            let tracked = match guarded("tracking", || Ok(tracker.track_extracted(&extracted?, may_be_keyframe)?)) {
                 Ok(tracked) => tracked,
                 Err(error) => {
                     summary.error = Some(error);

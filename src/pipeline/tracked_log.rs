@@ -8,9 +8,10 @@ use crossbeam::channel::{bounded, unbounded};
 
 use super::known_poses::{self, Scene};
 use super::map_thread::{MapSummary, MapThread, Round};
+use super::read_thread::ReadThread;
 use super::run::FRAMES_AHEAD;
 use super::track_thread::TrackThread;
-use super::{PipelineError, Progress, read_thread};
+use super::{PipelineError, Progress};
 use crate::evaluation::Exposures;
 use crate::geometry::Se3;
 use crate::gpu::Gpu;
@@ -58,7 +59,7 @@ impl<'a> TrackedLog<'a> {
             let frames = frames;
             Builder::new()
                 .name("reading".into())
-                .spawn_scoped(scope, move || read_thread::read(recording.sequence(), false, &frame_sender, progress))
+                .spawn_scoped(scope, move || ReadThread::new(recording, &frame_sender, progress).read())
                 .map_err(|source| PipelineError::Spawn { thread: "reading", source })?;
             let thread = TrackThread { recording, frames: &frames, mapper: &message_sender, progress };
             Ok::<_, PipelineError>(scene.as_ref().map_or_else(|| thread.track(), |scene| known_poses::follow(&thread, scene)))

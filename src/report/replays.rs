@@ -34,7 +34,7 @@ pub struct ReplayRow {
     pub keyframes: usize,
     /// ATE RMSE of the frames with a pose, metres; `None` if there are too few of them.
     pub ate_rmse_m: Option<f64>,
-    /// Mean time of the tracker, milliseconds.
+    /// Mean time from frame to frame, milliseconds: decoding, features and tracking, beside each other.
     pub ms_per_frame: f64,
 }
 
@@ -55,7 +55,7 @@ pub struct Distribution {
     pub worst_cm: f64,
     /// Frames without a pose, percent of all.
     pub lost_percent: f64,
-    /// Mean time of the tracker, milliseconds.
+    /// Mean time from frame to frame, milliseconds: decoding, features and tracking, beside each other.
     pub ms_per_frame: f64,
     /// All errors, centimetres, ascending.
     errors_cm: Vec<f64>,

@@ -2,6 +2,7 @@
 //!
 //! Adding a layout takes one file and one row in `layouts/mod.rs`.
 
+mod ahead;
 mod cameras;
 mod checks;
 mod error;

@@ -10,7 +10,8 @@
 mod adjustment;
 mod config;
 mod error;
-mod features;
+pub(crate) mod features;
+mod front_end;
 pub(crate) mod initialisation;
 mod localisation;
 mod loop_closing;
@@ -22,6 +23,8 @@ mod tracker;
 
 pub use config::TrackingConfig;
 pub use error::TrackingError;
+pub use front_end::{ExtractedFrame, FrontEnd};
+pub use loop_closing::ClosedLoop;
 pub use tracker::Tracker;
 
 use nalgebra::Vector2;

@@ -4,13 +4,15 @@
 //! A point needs two other views that agree on its depth. All features are expressed in the pinhole of the first view, so that photos
 //! may have different cameras. Left out: refinement of points and poses, and joining what several views see of one point.
 
+use std::sync::Arc;
+
 use nalgebra::{Point3, Vector2, Vector3};
 use rayon::prelude::*;
 
 use crate::geometry::{Camera, Pinhole, Se3};
 use crate::sequence::{Frame, Sensor};
-use crate::tracking::features::frame_features::{Feature, FrontEnd, luma};
-use crate::tracking::features::orb::Extractor;
+use crate::tracking::features::frame_features::Feature;
+use crate::tracking::front_end::FrontEnd;
 use crate::tracking::map::triangulation::{Candidates, MatchedPoint, match_along_lines};
 use crate::tracking::rig::Rig;
 use crate::tracking::{TrackingConfig, TrackingError};
@@ -59,9 +61,8 @@ impl PosedView {
     /// [`TrackingError`] if OpenCV fails.
     pub fn new(frame: &Frame, camera: &Camera, world_from_camera: &Se3, config: &TrackingConfig) -> Result<Self, TrackingError> {
         let Camera { pinhole, .. } = *camera;
-        let extractor = Extractor::new(pinhole.width, pinhole.height, config.features_kept(false), config);
-        let front_end = FrontEnd { camera: *camera, sensor: Sensor::Mono, extractor };
-        let features = front_end.features(frame, &luma(&frame.color), config)?.features;
+        let extracted = FrontEnd::new(*camera, Sensor::Mono, config).extract(frame)?;
+        let features = Arc::unwrap_or_clone(extracted.features).features;
         let color = |feature: &Feature| {
             let at = camera.distort_pixel(&feature.pixel);
             frame.color.get_pixel_checked(at.x.round() as u32, at.y.round() as u32).map_or([0; 3], |pixel| pixel.0)

@@ -12,7 +12,7 @@ use keysplat::geometry::Trajectory;
 use keysplat::report::replays::{ReplayRow, distributions, draw, to_csv, to_markdown};
 use keysplat::sequence::{SensorKind, Sequence};
 use keysplat::synthetic::SceneConfig;
-use keysplat::tracking::{Tracker, TrackingConfig};
+use keysplat::tracking::{FrontEnd, Tracker, TrackingConfig};
 use miette::{IntoDiagnostic, miette};
 use rayon::iter::{IntoParallelRefIterator, ParallelIterator};
 
@@ -20,7 +20,7 @@ use super::ablation::{Variant, parse_variant};
 use super::sweep::{recording, scene};
 use crate::cli::{Verbosity, generate, print, progress};
 
-/// Frames decoded ahead.
+/// Frames extracted ahead.
 const AHEAD: usize = 8;
 /// The room that other seeds furnish anew.
 const ROOM: &str = "room-noisy";
@@ -185,21 +185,31 @@ impl Replay<'_> {
         let frames = self.frames();
         let (name, config) = self.config;
         let mut tracker = Tracker::new(self.sequence.camera, self.sequence.sensor, config).into_diagnostic()?;
-        let mut seconds = 0.0;
+        let front_end = FrontEnd::new(self.sequence.camera, self.sequence.sensor, config);
+        let started = Instant::now();
         std::thread::scope(|scope| {
-            let (sender, receiver) = bounded(AHEAD);
-            let frames = &frames;
-            scope.spawn(move || frames.iter().all(|&i| sender.send(self.sequence.load(i)).is_ok()));
-            for frame in receiver {
+            let (sender, extracted) = bounded(AHEAD);
+            let (frames, front_end) = (&frames, &front_end);
+            scope.spawn(move || {
+                let ahead = rayon::current_num_threads().min(AHEAD);
                 // As in a run, a frame that cannot be read is passed over.
-                let Ok(frame) = frame else { continue };
-                let started = Instant::now();
-                tracker.track(&frame, true).into_diagnostic()?;
-                seconds += started.elapsed().as_secs_f64();
+                self.sequence.read_ahead(
+                    frames.iter().copied(),
+                    ahead,
+                    |frame| front_end.extract(&frame),
+                    |_, loaded| {
+                        let Ok(extracted) = loaded else { return true };
+                        sender.send(extracted).is_ok()
+                    },
+                );
+            });
+            for frame in extracted {
+                tracker.track_extracted(&frame.into_diagnostic()?, true).into_diagnostic()?;
             }
             tracker.finish().into_diagnostic()?;
             Ok::<_, miette::Report>(())
         })?;
+        let ms_per_frame = 1e3 * started.elapsed().as_secs_f64() / frames.len().max(1) as f64;
         let mut poses: Vec<_> = tracker.trajectory().into_iter().map(|(_, pose)| pose).collect();
         poses.sort_by(|a, b| a.timestamp_s.total_cmp(&b.timestamp_s));
         let lost = frames.len() - poses.len();
@@ -217,7 +227,7 @@ impl Replay<'_> {
             lost,
             keyframes: tracker.keyframe_count(),
             ate_rmse_m: errors.ok().map(|errors| errors.ate_rmse_m),
-            ms_per_frame: 1e3 * seconds / frames.len().max(1) as f64,
+            ms_per_frame,
         })
     }
 }

@@ -11,6 +11,7 @@ use std::time::Instant;
 pub(super) use scene::Scene;
 
 use super::progress::{TrackingProgress, guarded};
+use super::read_thread::QueuedFrame;
 use super::track_thread::{KeyframeSender, TrackSummary, TrackThread, right_image};
 use crate::geometry::{Se3, StampedPose};
 use crate::mapping::{DepthSource, Keyframe, MapperMessage};
@@ -86,7 +87,7 @@ pub(super) fn follow(thread: &TrackThread<'_>, scene: &Scene<'_>) -> TrackSummar
     if sequence.sensor != Sensor::Rgbd && mapper.send(MapperMessage::Points(scene.thinned_points())).is_err() {
         return summary;
     }
-    for frame in frames {
+    for QueuedFrame { frame, .. } in frames {
         let started = Instant::now();
         let known = recording.known_pose(frame.timestamp_s);
         let mut keyframe = None;

@@ -1,15 +1,11 @@
 //! The features of one frame as the tracker uses them: undistorted, with depth, in a grid for searches around a pixel.
 
-use image::RgbImage;
 use nalgebra::{Point3, Vector2};
 
-use crate::geometry::{Camera, Pinhole};
-use crate::sequence::{DepthImage, Frame, Sensor};
+use crate::geometry::Pinhole;
+use crate::tracking::TrackingConfig;
 use crate::tracking::features::descriptor::Descriptor;
-use crate::tracking::features::orb::{Extractor, Keypoint};
-use crate::tracking::features::stereo::{Eye, disparities};
 use crate::tracking::solvers::residual::Measurement;
-use crate::tracking::{TrackingConfig, TrackingError};
 
 /// Side of the search grid's cells, pixels.
 const CELL_PIXELS: f64 = 16.0;
@@ -93,69 +89,6 @@ impl FrameFeatures {
     }
 }
 
-/// Camera, sensor and ORB extractor: from a frame to its features.
-#[derive(Debug)]
-pub struct FrontEnd {
-    pub camera: Camera,
-    pub sensor: Sensor,
-    pub extractor: Extractor,
-}
-
-impl FrontEnd {
-    /// Extracts the features of a frame, with depth from its depth image or right image. `grey` is its luma, row-major.
-    pub fn features(&self, frame: &Frame, grey: &[u8], config: &TrackingConfig) -> Result<FrameFeatures, TrackingError> {
-        let (keypoints, depths) = match (self.sensor, &frame.right) {
-            (Sensor::Stereo { baseline_metres }, Some(right)) => {
-                self.stereo_depths(grey, right.as_raw(), baseline_metres, config)?
-            }
-            _ => {
-                let keypoints = self.extractor.extract(&self.extractor.pyramid(grey)?)?;
-                let depth = |k: &Keypoint| depth_at(frame.depth.as_ref()?, &k.pixel, config);
-                let depths = keypoints.iter().map(|k| Some((depth(k)?, config.inverse_depth_sigma))).collect();
-                (keypoints, depths)
-            }
-        };
-        let features = keypoints
-            .into_iter()
-            .zip(depths)
-            .filter(|(k, _)| frame.keeps(&k.pixel))
-            .map(|(k, depth)| Feature {
-                pixel: self.camera.undistort_pixel(&k.pixel),
-                octave: k.octave,
-                angle_rad: k.angle_rad,
-                depth_metres: depth.map(|(metres, _)| metres),
-                inverse_depth_sigma: depth.map_or(0.0, |(_, sigma)| sigma),
-                descriptor: k.descriptor,
-            })
-            .filter(|f| f.pixel.iter().all(|v| v.is_finite()))
-            .collect();
-        Ok(FrameFeatures::new(features, &self.camera.pinhole))
-    }
-
-    /// Keypoints of the left image with depths from the right one: depth = focal length · baseline / disparity.
-    fn stereo_depths(
-        &self,
-        left: &[u8],
-        right: &[u8],
-        baseline_metres: f64,
-        config: &TrackingConfig,
-    ) -> Result<(Vec<Keypoint>, Vec<MeasuredDepth>), TrackingError> {
-        let focal = self.camera.pinhole.fx;
-        let scale = focal * baseline_metres;
-        let eye = |grey| -> Result<_, TrackingError> {
-            let pyramid = self.extractor.pyramid(grey)?;
-            Ok((self.extractor.extract(&pyramid)?, pyramid))
-        };
-        let (left, right) = rayon::join(|| eye(left), || eye(right));
-        let ((keypoints, left), (others, right)) = (left?, right?);
-        let (left, right) = (Eye { keypoints: &keypoints, pyramid: &left }, Eye { keypoints: &others, pyramid: &right });
-        let disparities = disparities(left, right, focal, config.pyramid_scale)?;
-        let sigma = |k: &Keypoint| config.disparity_sigma * config.pyramid_scale.powi(k.octave.into()) / scale;
-        let depths = keypoints.iter().zip(disparities).map(|(k, disparity)| disparity.map(|d| (scale / d, sigma(k)))).collect();
-        Ok((keypoints, depths))
-    }
-}
-
 impl Feature {
     /// Measurement with weights from the noise model.
     pub fn measurement(&self, config: &TrackingConfig) -> Measurement {
@@ -168,39 +101,9 @@ impl Feature {
     }
 }
 
-/// Metres and the standard deviation of the inverse depth, 1/metres, where a depth was measured.
-type MeasuredDepth = Option<(f64, f64)>;
-
 /// The grid line (row or column) of a coordinate; what lies outside belongs to the border.
 fn cell(coordinate: f64, count: usize) -> usize {
     ((coordinate / CELL_PIXELS).max(0.0) as usize).min(count - 1)
-}
-
-/// Rec. 601 luma in integers, row-major.
-pub fn luma(image: &RgbImage) -> Vec<u8> {
-    let of = |[r, g, b]: [u8; 3]| ((u32::from(r) * 77 + u32::from(g) * 150 + u32::from(b) * 29 + 128) >> 8) as u8;
-    image.pixels().map(|p| of(p.0)).collect()
-}
-
-/// The depth at a recorded pixel, unless it is out of range, not finite, or on an edge.
-fn depth_at(depth: &DepthImage, pixel: &Vector2<f64>, config: &TrackingConfig) -> Option<f64> {
-    let (x, y) = (pixel.x.round(), pixel.y.round());
-    if x < 0.0 || y < 0.0 || x >= f64::from(depth.width) || y >= f64::from(depth.height) {
-        return None;
-    }
-    let (x, y) = (x as u32, y as u32);
-    let centre = f64::from(depth.at(x, y)?);
-    if !(centre >= config.min_depth_metres && centre <= config.max_depth_metres) {
-        return None;
-    }
-    for v in y.saturating_sub(1)..=(y + 1).min(depth.height - 1) {
-        for u in x.saturating_sub(1)..=(x + 1).min(depth.width - 1) {
-            if depth.at(u, v).is_some_and(|d| (f64::from(d) - centre).abs() > config.depth_edge_ratio * centre) {
-                return None;
-            }
-        }
-    }
-    Some(centre)
 }
 
 #[cfg(test)]
@@ -227,16 +130,5 @@ pub(crate) mod tests {
             let expected: Vec<usize> = (0..800).filter(|i| (list[*i].pixel - centre).norm() <= radius).collect();
             assert_eq!(found, expected);
         }
-    }
-
-    #[test]
-    fn depth_on_an_edge_or_out_of_range_is_left_out() {
-        let metres = (0..100).map(|i| if i % 10 < 5 { 1.0 } else { 2.0 }).collect();
-        let mut depth = DepthImage { width: 10, height: 10, metres };
-        depth.metres[3 * 10 + 1] = f32::NAN;
-        let at = |x: f64, y: f64| depth_at(&depth, &Vector2::new(x, y), &TrackingConfig::default());
-        assert_eq!(at(2.2, 6.0), Some(1.0));
-        assert_eq!((at(4.0, 6.0), at(5.0, 6.0), at(7.0, 6.0)), (None, None, Some(2.0)));
-        assert_eq!((at(1.0, 3.0), at(-3.0, 0.0), at(9.6, 2.0)), (None, None, None));
     }
 }

@@ -5,6 +5,7 @@ mod detection;
 #[cfg(test)]
 pub mod tests;
 
+use crate::geometry::Se3;
 use crate::tracking::map::Map;
 use crate::tracking::rig::Rig;
 use crate::tracking::solvers::pose_graph::Edge;
@@ -14,6 +15,17 @@ use detection::{Search, knows_scale};
 
 /// Least keyframes between two closed loops.
 const REST: usize = 5;
+
+/// A loop that was closed, or the place at which two submaps joined.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ClosedLoop {
+    /// The keyframe that shows the place, by its id.
+    pub keyframe: usize,
+    /// The keyframe that showed it before.
+    pub place: usize,
+    /// Their relative pose as the loop has it, metres.
+    pub keyframe_from_place: Se3,
+}
 
 /// Closes loops, and remembers them: later corrections keep to earlier ones.
 #[derive(Clone, Debug, Default)]
@@ -41,6 +53,12 @@ impl LoopCloser {
         let kind = if map.connects(keyframe, recognised.place) { "loop closed" } else { "submaps joined" };
         tracing::info!(keyframe, place = recognised.place, landmarks = recognised.matches.len(), "{kind}");
         correct(map, &recognised, &mut self.edges, scale_is_free, rig)
+    }
+
+    /// All loops, in the order in which they were closed.
+    pub fn loops(&self) -> Vec<ClosedLoop> {
+        let of = |e: &Edge| ClosedLoop { keyframe: e.a, place: e.b, keyframe_from_place: e.a_from_b.to_rigid() };
+        self.edges.iter().map(of).collect()
     }
 
     /// Whether a loop begins or ends at a keyframe.

@@ -134,7 +134,7 @@ impl Tracker {
 
     fn begin(&mut self, adjustment: Adjustment, around: Option<usize>) -> Result<(), TrackingError> {
         self.adjusting.worker.give(adjustment)?;
-        let most = if self.front_end.sensor == Sensor::Mono { 1 } else { TAKEN_IN_AFTER };
+        let most = if self.sensor == Sensor::Mono { 1 } else { TAKEN_IN_AFTER };
         let later = (self.adjusting.interval / TAKEN_IN_SHARE).clamp(1, most);
         self.adjusting.under_way = Some(UnderWay { around, due: self.frames_seen + later });
         Ok(())

@@ -5,8 +5,7 @@ use std::sync::Arc;
 
 use super::Tracker;
 use crate::geometry::Se3;
-use crate::sequence::Frame;
-use crate::tracking::features::frame_features::FrameFeatures;
+use crate::tracking::front_end::ExtractedFrame;
 use crate::tracking::localisation::dense_alignment::{DenseFrame, align};
 use crate::tracking::localisation::localise::LastFrame;
 use crate::tracking::localisation::localise::{Context, Localised};
@@ -19,33 +18,27 @@ const KEYFRAME_OVERLAP: f64 = 0.5;
 impl Tracker {
     /// The frame's pose from all its pixels, where features did not give it: against the last frame, then against the newest keyframe,
     /// which drifts less.
-    pub(super) fn localise_densely(
-        &mut self,
-        dense: Option<&DenseFrame>,
-        features: &FrameFeatures,
-        last: &LastFrame,
-        guess: Option<Se3>,
-    ) -> Option<Localised> {
+    pub(super) fn localise_densely(&mut self, frame: &ExtractedFrame, last: &LastFrame, guess: Option<Se3>) -> Option<Localised> {
         if self.lostness.frames_lost > MAX_FRAMES_BRIDGED {
             return None;
         }
-        let (frame, before) = (dense?, self.dense.last.as_ref()?);
+        let (dense, before) = (frame.dense.as_ref()?, self.dense.last.as_ref()?);
         let mut guesses = vec![self.motion.velocity.unwrap_or_default(), Se3::identity()];
         guesses.extend(guess.map(|pose| pose * last.camera_from_world.inverse()));
-        let mut camera_from_world = align(before, frame, &guesses)?.current_from_reference * last.camera_from_world;
+        let mut camera_from_world = align(before, dense, &guesses)?.current_from_reference * last.camera_from_world;
         if let Some((keyframe, view)) = &self.dense.keyframe {
             let pose = self.map.keyframes[*keyframe].camera_from_world;
             let guess = camera_from_world * pose.inverse();
-            if let Some(found) = align(view, frame, &[guess]).filter(|found| found.overlap >= KEYFRAME_OVERLAP) {
+            if let Some(found) = align(view, dense, &[guess]).filter(|found| found.overlap >= KEYFRAME_OVERLAP) {
                 camera_from_world = found.current_from_reference * pose;
             }
         }
         let mut context = Context { map: &mut self.map, rig: &self.rig };
-        Some(context.at_pose(features, camera_from_world, self.motion.reference))
+        Some(context.at_pose(&frame.features, camera_from_world, self.motion.reference))
     }
 
     /// How many frames are missing between the last one and this, going by the interval before.
-    pub(super) fn missing_before(&mut self, frame: &Frame) -> usize {
+    pub(super) fn missing_before(&mut self, frame: &ExtractedFrame) -> usize {
         let interval_s = self.arrival.map(|(last_s, _)| (frame.timestamp_s - last_s).abs());
         let usual_s = self.arrival.and_then(|(_, usual_s)| usual_s).filter(|usual_s| *usual_s > 0.0);
         self.arrival = Some((frame.timestamp_s, interval_s));

@@ -18,12 +18,12 @@ use adjusting::Adjusting;
 use crate::geometry::{Camera, Se3, StampedPose};
 use crate::sequence::{Frame, Sensor};
 use crate::tracking::adjustment::thread::Worker;
-use crate::tracking::features::frame_features::{FrameFeatures, FrontEnd, luma};
-use crate::tracking::features::orb::Extractor;
+use crate::tracking::features::frame_features::FrameFeatures;
+use crate::tracking::front_end::{ExtractedFrame, FrontEnd};
 use crate::tracking::initialisation::mono::FirstView;
-use crate::tracking::localisation::dense_alignment::{DenseFrame, DenseSampler};
+use crate::tracking::localisation::dense_alignment::DenseFrame;
 use crate::tracking::localisation::localise::{Context, LastFrame, Localised};
-use crate::tracking::loop_closing::LoopCloser;
+use crate::tracking::loop_closing::{ClosedLoop, LoopCloser};
 use crate::tracking::map::insertion;
 use crate::tracking::map::sparse_map::{Keyframe, Map};
 use crate::tracking::map::triangulation;
@@ -45,6 +45,7 @@ const MIN_INLIER_SHARE: f64 = 0.35;
 #[derive(Debug)]
 pub struct Tracker {
     rig: Rig,
+    sensor: Sensor,
     front_end: FrontEnd,
     map: Map,
     loops: LoopCloser,
@@ -84,10 +85,8 @@ struct Lostness {
 }
 
 /// Reference frames of dense RGB-D alignment.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 struct DenseState {
-    /// `None` for other sensors.
-    sampler: Option<DenseSampler>,
     last: Option<Arc<DenseFrame>>,
     /// The newest keyframe's id and pixels.
     keyframe: Option<(usize, Arc<DenseFrame>)>,
@@ -111,22 +110,18 @@ impl Tracker {
         config.validate().map_err(TrackingError::Config)?;
         let spacing = if sensor == Sensor::Mono { MONO_SPACING } else { 1.0 };
         let pinhole = camera.pinhole;
+        let front_end = FrontEnd::new(camera, sensor, config);
         let config = TrackingConfig {
             keyframe_translation: spacing * config.keyframe_translation,
             keyframe_rotation_rad: spacing * config.keyframe_rotation_rad,
             ..config.clone()
         };
         let worker = Worker::start(pinhole, config.bundle_iterations)?;
-        let features = config.features_kept(sensor == Sensor::Rgbd);
-        let extractor = Extractor::new(pinhole.width, pinhole.height, features, &config);
         Ok(Self {
-            dense: DenseState {
-                sampler: (sensor == Sensor::Rgbd).then(|| DenseSampler::new(&camera)),
-                last: None,
-                keyframe: None,
-            },
             rig: Rig { pinhole, config },
-            front_end: FrontEnd { camera, sensor, extractor },
+            sensor,
+            front_end,
+            dense: DenseState::default(),
             map: Map::default(),
             loops: LoopCloser::default(),
             first_view: None,
@@ -148,30 +143,35 @@ impl Tracker {
         self
     }
 
+    /// Extracts and tracks the next frame. With a [`FrontEnd`] of their own other threads can extract frames ahead.
+    ///
+    /// # Errors
+    /// Those of [`FrontEnd::extract`] and [`Self::track_extracted`].
+    pub fn track(&mut self, frame: &Frame, may_be_keyframe: bool) -> Result<TrackedFrame, TrackingError> {
+        let extracted = self.front_end.extract(frame)?;
+        self.track_extracted(&extracted, may_be_keyframe)
+    }
+
     /// Tracks the next frame. `may_be_keyframe` is false for frames that are held out from the mapper; until there is a map, such
     /// frames are Lost.
     ///
     /// # Errors
-    /// If the very first frame has no depth, if an image's size is not the camera's, or if OpenCV fails.
-    pub fn track(&mut self, frame: &Frame, may_be_keyframe: bool) -> Result<TrackedFrame, TrackingError> {
-        self.check(frame)?;
+    /// [`TrackingError::FirstFrameWithoutDepth`] for an RGB-D camera, [`TrackingError::Adjusting`] if the adjustment panicked.
+    pub fn track_extracted(&mut self, frame: &ExtractedFrame, may_be_keyframe: bool) -> Result<TrackedFrame, TrackingError> {
+        if self.frames_seen == 0 && self.sensor == Sensor::Rgbd && !frame.has_depth_image {
+            return Err(TrackingError::FirstFrameWithoutDepth { frame: frame.index });
+        }
         self.frames_seen += 1;
         self.lostness.frames_lost += self.missing_before(frame);
-        let mut times = StageTimes::default();
-        let clock = Instant::now();
-        let grey = luma(&frame.color);
-        let features = Arc::new(self.front_end.features(frame, &grey, &self.rig.config)?);
-        let sampled = self.dense.sampler.as_ref().zip(frame.depth.as_ref());
-        let dense = sampled.map(|(sampler, depth)| Arc::new(sampler.sample(&grey, depth, &self.rig.config)));
-        times.features_ms = milliseconds(clock);
+        let mut times = StageTimes { features_ms: frame.features_ms, ..StageTimes::default() };
         self.take_adjusted(&mut times)?;
         let mut tracked = match self.motion.last.take() {
-            Some(last) => self.go_on(frame, features, dense.as_deref(), last, may_be_keyframe, times)?,
-            None if self.front_end.sensor == Sensor::Mono => self.start_without_depth(frame, features, may_be_keyframe, times),
-            None => self.start(frame, features, may_be_keyframe, times),
+            Some(last) => self.go_on(frame, last, may_be_keyframe, times)?,
+            None if self.sensor == Sensor::Mono => self.start_without_depth(frame, may_be_keyframe, times),
+            None => self.start(frame, may_be_keyframe, times),
         };
         if tracked.state == TrackingState::Tracking {
-            self.keep_dense(dense, tracked.keyframe.is_some());
+            self.keep_dense(frame.dense.clone(), tracked.keyframe.is_some());
         }
         tracked.updates = self.updates();
         Ok(tracked)
@@ -180,25 +180,23 @@ impl Tracker {
     /// Tracks a frame when there is a map.
     fn go_on(
         &mut self,
-        frame: &Frame,
-        features: Arc<FrameFeatures>,
-        dense: Option<&DenseFrame>,
+        frame: &ExtractedFrame,
         last: LastFrame,
         may_be_keyframe: bool,
         mut times: StageTimes,
     ) -> Result<TrackedFrame, TrackingError> {
         let clock = Instant::now();
-        let mut found = self.localise(&features, &last);
+        let mut found = self.localise(&frame.features, &last);
         if found.as_ref().is_none_or(|f| f.inliers < FEW_INLIERS) {
             let guess = found.as_ref().map(|f| f.camera_from_world);
-            found = self.localise_densely(dense, &features, &last, guess).or(found);
+            found = self.localise_densely(frame, &last, guess).or(found);
         }
         times.localise_ms = milliseconds(clock);
         if let Some(found) = found {
-            return self.accept(frame, features, &last, found, may_be_keyframe, times);
+            return self.accept(frame, &last, found, may_be_keyframe, times);
         }
         self.motion.last = Some(last);
-        self.lose(frame, features, may_be_keyframe, times)
+        self.lose(frame, may_be_keyframe, times)
     }
 
     /// Final pose of every tracked frame (index in the sequence, pose), each carried by its reference keyframe so that later
@@ -225,6 +223,11 @@ impl Tracker {
         self.map.keyframes.iter().enumerate().filter(|(_, k)| k.root == largest).map(pose).collect()
     }
 
+    /// Loops closed so far, submaps joined among them.
+    pub fn loops(&self) -> Vec<ClosedLoop> {
+        self.loops.loops()
+    }
+
     /// How many keyframes there have been, of all submaps.
     pub fn keyframe_count(&self) -> usize {
         self.map.keyframes.len()
@@ -233,23 +236,6 @@ impl Tracker {
     /// How many keyframes have not been culled.
     pub fn living_keyframes(&self) -> usize {
         self.map.keyframes.len() - self.map.culled.len()
-    }
-
-    fn check(&self, frame: &Frame) -> Result<(), TrackingError> {
-        let (width, height) = (self.rig.pinhole.width, self.rig.pinhole.height);
-        let size = |what, (found_width, found_height)| {
-            let good = (found_width, found_height) == (width, height);
-            let error = TrackingError::Size { frame: frame.index, what, width, height, found_width, found_height };
-            if good { Ok(()) } else { Err(error) }
-        };
-        size("colour", frame.color.dimensions())?;
-        match &frame.depth {
-            Some(depth) => size("depth", (depth.width, depth.height)),
-            None if self.frames_seen == 0 && self.front_end.sensor == Sensor::Rgbd => {
-                Err(TrackingError::FirstFrameWithoutDepth { frame: frame.index })
-            }
-            None => Ok(()),
-        }
     }
 
     /// The frame's pose, if it can be trusted.
@@ -287,8 +273,7 @@ impl Tracker {
     /// Takes a trusted pose in: motion, reference, record, and a keyframe if one is due.
     fn accept(
         &mut self,
-        frame: &Frame,
-        features: Arc<FrameFeatures>,
+        frame: &ExtractedFrame,
         last: &LastFrame,
         found: Localised,
         may_be_keyframe: bool,
@@ -301,6 +286,7 @@ impl Tracker {
         self.first_view = None;
         let covisibility = self.map.covisibility(found.landmarks.iter().flatten().copied());
         self.motion.reference = covisibility.first().map_or(self.motion.reference, |(k, _)| *k);
+        let features = frame.features.clone();
         let due =
             may_be_keyframe && keyframe_selection::is_due(&self.map, &features, &found, self.motion.reference, &self.rig.config);
         let Localised { camera_from_world, landmarks, inliers, dense, .. } = found;
@@ -319,7 +305,12 @@ impl Tracker {
     }
 
     /// Makes the frame that was just tracked a keyframe. `held`: by landmarks, instead of by all pixels.
-    fn make_keyframe(&mut self, frame: &Frame, held: bool, times: &mut StageTimes) -> Result<Option<NewKeyframe>, TrackingError> {
+    fn make_keyframe(
+        &mut self,
+        frame: &ExtractedFrame,
+        held: bool,
+        times: &mut StageTimes,
+    ) -> Result<Option<NewKeyframe>, TrackingError> {
         self.finish_adjustment_before_keyframe(times)?;
         let Some(LastFrame { features, camera_from_world, landmarks }) = self.motion.last.take() else { return Ok(None) };
         let clock = Instant::now();
@@ -351,7 +342,7 @@ impl Tracker {
         let keyframe = &self.map.keyframes[id];
         let depth = |l: usize| (keyframe.camera_from_world * self.map.landmarks[l].position).z;
         let pairs = keyframe.features.features.iter().zip(&keyframe.landmarks);
-        let seen = match self.front_end.sensor {
+        let seen = match self.sensor {
             Sensor::Rgbd => Vec::new(),
             _ => pairs.filter_map(|(f, l)| l.map(|l| (f.pixel, depth(l)))).filter(|(_, z)| *z > 0.0).collect(),
         };
@@ -359,7 +350,7 @@ impl Tracker {
         NewKeyframe { id, world_from_camera, seen, covisible: self.map.covisible(id) }
     }
 
-    fn record(&mut self, frame: &Frame, reference: usize, camera_from_reference: Se3) {
+    fn record(&mut self, frame: &ExtractedFrame, reference: usize, camera_from_reference: Se3) {
         self.records.push(Record { frame_index: frame.index, timestamp_s: frame.timestamp_s, reference, camera_from_reference });
     }
 }

@@ -1,11 +1,8 @@
 //! How a submap begins: with one frame where there is depth, else with two.
 
-use std::sync::Arc;
-
 use super::{Lostness, Motion, Record, Tracker};
 use crate::geometry::Se3;
-use crate::sequence::Frame;
-use crate::tracking::features::frame_features::FrameFeatures;
+use crate::tracking::front_end::ExtractedFrame;
 use crate::tracking::initialisation::mono::{self, FirstView, SecondView};
 use crate::tracking::localisation::localise::LastFrame;
 use crate::tracking::map::insertion;
@@ -14,7 +11,8 @@ use crate::tracking::{StageTimes, TrackedFrame, TrackingState};
 
 impl Tracker {
     /// Starts a submap with a frame that shows enough.
-    pub(super) fn start(&mut self, frame: &Frame, features: Arc<FrameFeatures>, may: bool, times: StageTimes) -> TrackedFrame {
+    pub(super) fn start(&mut self, frame: &ExtractedFrame, may: bool, times: StageTimes) -> TrackedFrame {
+        let features = frame.features.clone();
         let with_depth = features.features.iter().filter(|f| f.depth_metres.is_some()).count();
         if !may || with_depth < self.rig.config.min_initial_landmarks {
             return TrackedFrame::lost(times);
@@ -36,16 +34,11 @@ impl Tracker {
     }
 
     /// Starts a submap with two frames that show one scene from two places.
-    pub(super) fn start_without_depth(
-        &mut self,
-        frame: &Frame,
-        features: Arc<FrameFeatures>,
-        may: bool,
-        times: StageTimes,
-    ) -> TrackedFrame {
+    pub(super) fn start_without_depth(&mut self, frame: &ExtractedFrame, may: bool, times: StageTimes) -> TrackedFrame {
         if !may {
             return TrackedFrame::lost(times);
         }
+        let features = frame.features.clone();
         let matches = self.first_view.as_mut().and_then(|first| first.follow(&features, &self.rig.pinhole));
         let (Some(first), Some(matches)) = (&self.first_view, matches) else {
             self.first_view = Some(FirstView::new(frame.index, frame.timestamp_s, features));

@@ -5,12 +5,11 @@
 //! the others sees it.
 
 use std::collections::BTreeMap;
-use std::sync::Arc;
 
 use super::Tracker;
 use crate::geometry::Se3;
-use crate::sequence::{Frame, Sensor};
-use crate::tracking::features::frame_features::FrameFeatures;
+use crate::sequence::Sensor;
+use crate::tracking::front_end::ExtractedFrame;
 use crate::tracking::{StageTimes, TrackedFrame, TrackingError};
 
 /// Seconds without a pose after which a new submap begins.
@@ -22,8 +21,7 @@ impl Tracker {
     /// A frame without a pose: after a while it begins a new submap.
     pub(super) fn lose(
         &mut self,
-        frame: &Frame,
-        features: Arc<FrameFeatures>,
+        frame: &ExtractedFrame,
         may_be_keyframe: bool,
         mut times: StageTimes,
     ) -> Result<TrackedFrame, TrackingError> {
@@ -35,9 +33,9 @@ impl Tracker {
             return Ok(TrackedFrame::lost(times));
         }
         self.finish_adjustment_before_keyframe(&mut times)?;
-        Ok(match self.front_end.sensor {
-            Sensor::Mono => self.start_without_depth(frame, features, may_be_keyframe, times),
-            _ => self.start(frame, features, may_be_keyframe, times),
+        Ok(match self.sensor {
+            Sensor::Mono => self.start_without_depth(frame, may_be_keyframe, times),
+            _ => self.start(frame, may_be_keyframe, times),
         })
     }
 

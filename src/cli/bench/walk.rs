@@ -1,0 +1,142 @@
+//! `keysplat bench walk`
+
+use std::path::PathBuf;
+use std::time::Instant;
+
+use clap::Args;
+use keysplat::Config;
+use keysplat::evaluation::{Alignment, evaluate_trajectory};
+use keysplat::files::write_atomically;
+use keysplat::geometry::{Se3, StampedPose, Trajectory};
+use keysplat::tracking::{ClosedLoop, Tracker};
+use keysplat::verification::walk::{Walk, World};
+use miette::IntoDiagnostic;
+
+use crate::cli::{Verbosity, print, progress};
+
+/// A walk is reported in this many parts.
+const PARTS: usize = 10;
+
+#[derive(Args)]
+pub(super) struct WalkArgs {
+    /// What is walked through.
+    #[arg(value_enum)]
+    world: World,
+    /// Frames of a walk.
+    #[arg(long, default_value_t = 10_000, value_parser = clap::value_parser!(u32).range(10..))]
+    frames: u32,
+    /// Walks through differing worlds.
+    #[arg(long, default_value_t = 1)]
+    seeds: u64,
+    /// Settings by their keys in config.toml, e.g. tracking.keyframe_overlap=0.7 (may be given again).
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    settings: Vec<String>,
+    /// Folder for walk.csv and walk.md.
+    #[arg(short, long)]
+    out: PathBuf,
+}
+
+/// A tenth of a walk.
+#[derive(Default)]
+struct Part {
+    frames: usize,
+    lost: usize,
+    total_ms: f64,
+    longest_ms: f64,
+    keyframes: usize,
+    living: usize,
+    /// Of this process, bytes; 0 where the system does not say.
+    memory: u64,
+}
+
+struct Outcome {
+    parts: Vec<Part>,
+    loops: usize,
+    wrong_loops: usize,
+    ate_rmse_m: Option<f64>,
+}
+
+pub(super) fn walk(args: &WalkArgs, verbosity: Verbosity) -> miette::Result<()> {
+    std::fs::create_dir_all(&args.out).into_diagnostic()?;
+    let bar = progress::bar(verbosity, args.seeds * u64::from(args.frames), "{wide_bar} {pos}/{len} frames  {msg}");
+    let mut table = String::from(
+        "| seed | frames | lost | keyframes | living | loops | wrong | ATE RMSE, cm | ms a frame | longest | memory, MB |\n\
+         |---|---|---|---|---|---|---|---|---|---|---|\n",
+    );
+    let mut csv = String::from("seed,frame,lost,keyframes,living,ms_per_frame,longest_ms,memory_bytes\n");
+    for seed in 0..args.seeds {
+        let outcome = replay(args, seed, &bar)?;
+        let Outcome { parts, loops, wrong_loops, ate_rmse_m } = &outcome;
+        let mut frame = 0;
+        for part in parts {
+            frame += part.frames;
+            let ms = part.total_ms / part.frames.max(1) as f64;
+            let Part { lost, keyframes, living, longest_ms, memory, .. } = part;
+            csv += &format!("{seed},{frame},{lost},{keyframes},{living},{ms:.3},{longest_ms:.2},{memory}\n");
+            if args.seeds == 1 {
+                let megabytes = memory >> 20;
+                table +=
+                    &format!("| | {frame} | {lost} | {keyframes} | {living} | | | | {ms:.2} | {longest_ms:.1} | {megabytes} |\n");
+            }
+        }
+        let last = parts.last().map_or((0, 0, 0), |p| (p.keyframes, p.living, p.memory >> 20));
+        let lost: usize = parts.iter().map(|p| p.lost).sum();
+        let ms = parts.iter().map(|p| p.total_ms).sum::<f64>() / frame.max(1) as f64;
+        let longest = parts.iter().map(|p| p.longest_ms).fold(0.0, f64::max);
+        let ate = ate_rmse_m.map_or_else(|| "–".into(), |metres| format!("{:.2}", 100.0 * metres));
+        let (keyframes, living, memory) = last;
+        table += &format!(
+            "| {seed} | {frame} | {lost} | {keyframes} | {living} | {loops} | {wrong_loops} | {ate} | {ms:.2} | {longest:.1} | {memory} |\n"
+        );
+    }
+    bar.finish_and_clear();
+    for (name, text) in [("walk.csv", &csv), ("walk.md", &table)] {
+        write_atomically(&args.out.join(name), text.as_bytes()).into_diagnostic()?;
+    }
+    print(&table)
+}
+
+fn replay(args: &WalkArgs, seed: u64, bar: &indicatif::ProgressBar) -> miette::Result<Outcome> {
+    let config = Config::default().with_settings(&args.settings).into_diagnostic()?.tracking;
+    let mut walk = Walk::new(args.world, seed, &config);
+    let mut tracker = Tracker::new(Walk::camera(), args.world.sensor(), &config).into_diagnostic()?;
+    let frames = args.frames as usize;
+    let mut truth = Trajectory::default();
+    let mut parts: Vec<Part> = (0..PARTS).map(|_| Part::default()).collect();
+    for i in 0..frames {
+        let (frame, world_from_camera) = walk.frame();
+        truth.poses.push(StampedPose { timestamp_s: frame.timestamp_s(), world_from_camera });
+        let started = Instant::now();
+        let tracked = tracker.track_extracted(&frame, true).into_diagnostic()?;
+        let ms = 1e3 * started.elapsed().as_secs_f64();
+        let part = &mut parts[i * PARTS / frames];
+        part.frames += 1;
+        part.lost += usize::from(tracked.world_from_camera.is_none());
+        part.total_ms += ms;
+        part.longest_ms = part.longest_ms.max(ms);
+        (part.keyframes, part.living) = (tracker.keyframe_count(), tracker.living_keyframes());
+        if i % 100 == 0 {
+            part.memory = memory();
+            bar.set_position(seed * frames as u64 + i as u64);
+        }
+    }
+    tracker.finish().into_diagnostic()?;
+    let keyframes = tracker.keyframes();
+    let true_pose = |id: usize| Some(truth.poses[keyframes.iter().find(|k| k.id == id)?.frame_index].world_from_camera);
+    let loops = tracker.loops();
+    let is_wrong = |l: &&ClosedLoop| {
+        let Some((keyframe, place)) = true_pose(l.keyframe).zip(true_pose(l.place)) else { return false };
+        let error: Se3 = l.keyframe_from_place.inverse() * keyframe.inverse() * place;
+        error.translation.vector.norm() > args.world.loop_tolerance_metres()
+    };
+    let wrong_loops = loops.iter().filter(is_wrong).count();
+    let poses = tracker.trajectory().into_iter().map(|(_, pose)| pose).collect();
+    let errors = evaluate_trajectory(&truth, &Trajectory { poses }, Alignment::Rigid);
+    Ok(Outcome { parts, loops: loops.len(), wrong_loops, ate_rmse_m: errors.ok().map(|e| e.ate_rmse_m) })
+}
+
+/// Resident memory of this process, bytes; 0 where the system does not say.
+fn memory() -> u64 {
+    let pages = std::fs::read_to_string("/proc/self/statm").ok();
+    pages.and_then(|text| text.split(' ').nth(1)?.parse::<u64>().ok()).map_or(0, |pages| pages * 4096)
+}
