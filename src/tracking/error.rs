@@ -32,10 +32,10 @@ pub enum TrackingError {
         found_height: u32,
     },
     /// The system gave no thread.
-    #[error("the thread for bundle adjustment could not be started: {0}")]
+    #[error("a thread of the tracker could not be started: {0}")]
     Spawn(#[source] std::io::Error),
     /// The adjustment thread panicked.
-    #[error("the thread for bundle adjustment panicked; what was tracked until then is kept. Please report this")]
+    #[error("a thread of the tracker panicked; what was tracked until then is kept. Please report this")]
     Adjusting,
     /// OpenCV failed.
     #[error("OpenCV failed while extracting features: {0}")]

@@ -20,6 +20,7 @@ mod rig;
 pub(crate) mod solvers;
 pub(crate) mod structure;
 mod tracker;
+mod worker;
 
 pub use config::TrackingConfig;
 pub use error::TrackingError;

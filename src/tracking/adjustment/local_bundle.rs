@@ -5,6 +5,8 @@
 //! landmarks hold them in place. The first keyframe of a submap is its world and never moves. An [`Adjustment`] is a plain value that can be solved
 //! elsewhere while the map goes on: taking it in touches only what is still there.
 
+use std::collections::BTreeMap;
+
 use crate::geometry::{Pinhole, Se3};
 use crate::tracking::TrackingConfig;
 use crate::tracking::map::sparse_map::{LandmarkState, Map, Observation};
@@ -16,8 +18,8 @@ use crate::tracking::solvers::residual::InlierClass;
 const MIN_SHARED: usize = 15;
 /// Keyframes that hold the window in place, at most; bounds the time.
 const MAX_FIXED: usize = 40;
-/// Keyframes that one adjustment may move: a bound on its time, which is then some seconds, and on its memory.
-const MAX_ADJUSTED: usize = 1000;
+/// Observations of one adjustment: bounds the time of making it and of taking it in.
+const MOST_OBSERVATIONS: usize = 100_000;
 
 /// A part of the map to be adjusted: the problem, and what its numbers mean.
 #[derive(Clone, Debug, Default)]
@@ -29,8 +31,9 @@ pub struct Adjustment {
     landmarks: Vec<usize>,
     /// The observation of each observation.
     observations: Vec<Observation>,
-    /// Keyframes in the map when it was made.
+    /// Keyframes in the map when it was made, and corrections of the whole until then.
     known: usize,
+    corrections: usize,
 }
 
 impl Adjustment {
@@ -40,11 +43,11 @@ impl Adjustment {
         Self::new(map, &free, &fixed, config)
     }
 
-    /// Global bundle adjustment; `None` with too many keyframes.
-    pub fn of_all(map: &Map, config: &TrackingConfig) -> Option<Self> {
-        let living = (0..map.keyframes.len()).filter(|k| !map.culled.contains_key(k));
-        let (roots, free): (Vec<usize>, Vec<usize>) = living.partition(|k| map.is_root(*k));
-        if free.len() > MAX_ADJUSTED { None } else { Self::new(map, &free, &roots, config) }
+    /// Global bundle adjustment of the submap that begins with `root`; `None` if it is too large for one adjustment.
+    pub fn of_all(map: &Map, root: usize, config: &TrackingConfig) -> Option<Self> {
+        let free: Vec<usize> = map.living_in(root).filter(|k| *k != root).collect();
+        let observations = free.iter().map(|k| map.keyframes[*k].landmarks.iter().flatten().count()).sum::<usize>();
+        if observations > MOST_OBSERVATIONS { None } else { Self::new(map, &free, &[root], config) }
     }
 
     /// Bundle adjustment of the keyframes `free` and all their landmarks, with `fixed` held constant.
@@ -56,7 +59,7 @@ impl Adjustment {
         landmarks.retain(|l| map.landmarks[*l].observations.len() > 1);
         let keyframes: Vec<usize> = free.iter().chain(fixed).copied().collect();
         let (problem, observations) = make_problem(map, &keyframes, free.len(), &landmarks, config);
-        Some(Self { problem, keyframes, landmarks, observations, known: map.keyframes.len() })
+        Some(Self { problem, keyframes, landmarks, observations, known: map.keyframes.len(), corrections: map.corrections })
     }
 
     /// Moves poses and points to where they agree best, twice: outliers are found by the first round and left out of the second.
@@ -67,53 +70,48 @@ impl Adjustment {
         }
     }
 
+    /// Whether the map is still the one that this was made of: no correction of the whole came between.
+    pub fn fits(&self, map: &Map) -> bool {
+        self.corrections == map.corrections
+    }
+
     /// Takes the result into the map; returns the keyframes that may have moved, in ascending order. Keyframes that came since go
-    /// rigidly with the one that they share most with.
+    /// rigidly with the one that they share most with. What hangs on a keyframe goes with it.
     pub fn apply(&self, map: &mut Map, config: &TrackingConfig) -> Vec<usize> {
-        let before: Vec<Se3> = map.keyframes.iter().map(|k| k.camera_from_world).collect();
-        let mut moves = vec![false; before.len()];
-        for (k, pose) in self.keyframes.iter().zip(&self.problem.poses).take(self.problem.free_poses) {
-            map.keyframes[*k].camera_from_world = *pose;
-            moves[*k] = true;
+        let free = &self.keyframes[..self.problem.free_poses];
+        let mut before: BTreeMap<usize, Se3> = BTreeMap::new();
+        for (k, pose) in free.iter().zip(&self.problem.poses) {
+            if map.culled.contains_key(k) {
+                continue;
+            }
+            before.insert(*k, map.keyframes[*k].camera_from_world);
+            map.set_pose(*k, *pose);
         }
-        for newer in self.known..before.len() {
-            let Some((neighbour, _)) = map.covisible(newer).into_iter().find(|(k, _)| moves[*k]) else { continue };
-            let newer_from_neighbour = before[newer] * before[neighbour].inverse();
-            map.keyframes[newer].camera_from_world = newer_from_neighbour * map.keyframes[neighbour].camera_from_world;
-            moves[newer] = true;
+        for newer in self.known..map.keyframes.len() {
+            let Some((neighbour, _)) = map.covisible(newer).into_iter().find(|(k, _)| before.contains_key(k)) else { continue };
+            let pose = map.keyframes[newer].camera_from_world;
+            let newer_from_neighbour = pose * before[&neighbour].inverse();
+            before.insert(newer, pose);
+            map.set_pose(newer, newer_from_neighbour * map.keyframes[neighbour].camera_from_world);
         }
-        map.carry_culled();
-        let moved: Vec<usize> = (0..moves.len()).filter(|k| moves[map.living(*k)]).collect();
-        self.move_landmarks(map, &before, &moved);
+        for (l, point) in self.landmarks.iter().zip(&self.problem.points) {
+            if map.landmarks[*l].state == LandmarkState::Alive {
+                map.set_position(*l, point);
+            }
+        }
         for (o, observation) in self.problem.observations.iter().zip(&self.observations) {
             let landmark = self.landmarks[o.point];
-            let still_seen = map.keyframes[observation.keyframe].landmarks[observation.feature] == Some(landmark);
-            if o.class == InlierClass::Outlier && still_seen {
+            let seen = map.keyframes[observation.keyframe].landmarks.get(observation.feature);
+            if o.class == InlierClass::Outlier && seen == Some(&Some(landmark)) {
                 map.remove_observation(landmark, *observation);
             }
         }
         for l in &self.landmarks {
             map.refresh_geometry(*l, config);
         }
+        let mut moved: Vec<usize> = before.keys().flat_map(|k| map.with_carried(*k)).collect();
+        moved.sort_unstable();
         moved
-    }
-
-    /// Landmarks of the problem to their new places; those that only the moved keyframes know go with the one that saw them first.
-    fn move_landmarks(&self, map: &mut Map, before: &[Se3], moved: &[usize]) {
-        let mut adjusted = vec![false; map.landmarks.len()];
-        for (l, point) in self.landmarks.iter().zip(&self.problem.points) {
-            adjusted[*l] = true;
-            if map.landmarks[*l].state == LandmarkState::Alive {
-                map.landmarks[*l].position = *point;
-            }
-        }
-        for l in map.landmarks_of(moved).into_iter().filter(|l| !adjusted[*l]) {
-            let Some(owner) = map.landmarks[l].observations.first().map(|s| s.keyframe) else { continue };
-            if moved.binary_search(&owner).is_ok() {
-                let p_in_camera = before[owner] * map.landmarks[l].position;
-                map.landmarks[l].position = map.keyframes[owner].camera_from_world.inverse_transform_point(&p_in_camera);
-            }
-        }
     }
 }
 
@@ -150,18 +148,17 @@ fn make_problem(
     landmarks: &[usize],
     config: &TrackingConfig,
 ) -> (BundleProblem, Vec<Observation>) {
-    let mut place = vec![None; map.keyframes.len()];
-    keyframes.iter().enumerate().for_each(|(i, k)| place[*k] = Some(i));
+    let place: BTreeMap<usize, usize> = keyframes.iter().enumerate().map(|(i, k)| (*k, i)).collect();
     let mut problem = BundleProblem {
         poses: keyframes.iter().map(|k| map.keyframes[*k].camera_from_world).collect(),
         free_poses,
-        points: landmarks.iter().map(|l| map.landmarks[*l].position).collect(),
+        points: landmarks.iter().map(|l| map.position(*l)).collect(),
         ..Default::default()
     };
     let mut observations = Vec::new();
     for (point, l) in landmarks.iter().enumerate() {
         for observation in &map.landmarks[*l].observations {
-            let Some(pose) = place[observation.keyframe] else { continue };
+            let Some(&pose) = place.get(&observation.keyframe) else { continue };
             let measurement = map.keyframes[observation.keyframe].features.features[observation.feature].measurement(config);
             let class = if measurement.inverse_depth.is_some() { InlierClass::Full } else { InlierClass::PixelOnly };
             problem.observations.push(BundleObservation { pose, point, measurement, class });
@@ -191,7 +188,7 @@ mod tests {
         // A newer keyframe sees what the last one saw, and one landmark of its own.
         let newer = map.keyframes.len();
         let seen = map.keyframes[last].landmarks.clone();
-        map.keyframes.push(Keyframe { landmarks: vec![None; seen.len()], ..map.keyframes[last].clone() });
+        map.push(Keyframe { landmarks: vec![None; seen.len()], ..map.keyframes[last].clone() });
         for (feature, landmark) in seen.into_iter().enumerate().skip(1) {
             landmark.into_iter().for_each(|l| map.add_observation(l, Observation { keyframe: newer, feature }));
         }
@@ -203,7 +200,7 @@ mod tests {
         let moved = window.apply(&mut map, &config);
         assert!(moved.contains(&last) && moved.contains(&newer) && !moved.contains(&0) && moved.is_sorted());
         assert!(se3::log(&(map.keyframes[newer].camera_from_world * (pose * push).inverse())).norm() < 1e-12);
-        assert!((map.landmarks[own].position - push.inverse() * Point3::new(1.0, 2.0, 3.0)).norm() < 1e-12);
+        assert!((map.position(own) - push.inverse() * Point3::new(1.0, 2.0, 3.0)).norm() < 1e-12);
         assert!(map.landmarks[gone].state == LandmarkState::Removed && map.landmarks[gone].observations.is_empty());
     }
 }

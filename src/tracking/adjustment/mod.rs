@@ -1,4 +1,3 @@
 //! Local and global bundle adjustment of the map, in a thread of its own.
 
 pub mod local_bundle;
-pub mod thread;

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use nalgebra::{Point3, Vector2};
+use nalgebra::Vector2;
 
 use crate::geometry::{Pinhole, Se3};
 use crate::tracking::TrackingConfig;
@@ -74,17 +74,9 @@ pub fn first_map(first: &FirstView, second: &SecondView<'_>, matches: &[Match], 
     let pixels: Vec<(Vector2<f64>, Vector2<f64>)> =
         matches.iter().map(|m| (first.features.features[m.query].pixel, features.features[m.feature].pixel)).collect();
     let found = two_views(&pixels, pinhole)?;
-    let keyframe = |frame_index, timestamp_s, camera_from_world, features: &Arc<FrameFeatures>| Keyframe {
-        root: 0,
-        frame_index,
-        timestamp_s,
-        camera_from_world,
-        landmarks: vec![None; features.len()],
-        features: features.clone(),
-    };
     let mut map = Map::default();
-    map.keyframes.push(keyframe(first.frame_index, first.timestamp_s, Se3::identity(), &first.features));
-    map.keyframes.push(keyframe(frame_index, timestamp_s, found.second_from_first, features));
+    map.push(Keyframe::new(first.frame_index, first.timestamp_s, Se3::identity(), first.features.clone()));
+    map.push(Keyframe::new(frame_index, timestamp_s, found.second_from_first, features.clone()));
     for (m, point) in matches.iter().zip(&found.points) {
         let Some(point) = point else { continue };
         let landmark = map.add_landmark(Observation { keyframe: 0, feature: m.query }, *point, config);
@@ -102,7 +94,7 @@ fn rescale(map: &mut Map, config: &TrackingConfig) -> Option<()> {
         keyframe.camera_from_world.translation.vector *= scale;
     }
     for landmark in 0..map.landmarks.len() {
-        map.landmarks[landmark].position = Point3::from(map.landmarks[landmark].position.coords * scale);
+        map.landmarks[landmark].in_anchor.coords *= scale;
         map.refresh_descriptor(landmark);
         map.refresh_geometry(landmark, config);
     }

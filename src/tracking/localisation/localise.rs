@@ -115,7 +115,7 @@ impl Context<'_> {
     pub fn view_of_last(&self, last: &LastFrame) -> View {
         let world_from_camera = last.camera_from_world.inverse();
         let temporary = |i| last.features.point_in_camera(i, &self.rig.pinhole).map(|p| world_from_camera * p);
-        let point = |i: usize| last.landmarks[i].map(|l| self.map.landmarks[l].position).or_else(|| temporary(i));
+        let point = |i: usize| last.landmarks[i].map(|l| self.map.position(l)).or_else(|| temporary(i));
         View {
             features: last.features.clone(),
             points: (0..last.features.len()).map(point).collect(),
@@ -128,7 +128,7 @@ impl Context<'_> {
         let keyframe = &self.map.keyframes[keyframe];
         View {
             features: keyframe.features.clone(),
-            points: keyframe.landmarks.iter().map(|l| l.map(|l| self.map.landmarks[l].position)).collect(),
+            points: keyframe.landmarks.iter().map(|l| l.map(|l| self.map.position(l))).collect(),
             landmarks: keyframe.landmarks.clone(),
         }
     }
@@ -153,11 +153,11 @@ impl Context<'_> {
         let taken: Vec<bool> = start.landmarks.iter().map(Option::is_some).collect();
         let mut pairs: Vec<(usize, usize)> =
             start.landmarks.iter().enumerate().filter_map(|(feature, l)| l.map(|l| (l, feature))).collect();
-        let mut matched = vec![false; self.map.landmarks.len()];
-        pairs.iter().for_each(|(l, _)| matched[*l] = true);
+        let mut matched: Vec<usize> = pairs.iter().map(|(l, _)| *l).collect();
+        matched.sort_unstable();
         let mut visible = self.map.visible(self.local_landmarks(start, reference), &start.camera_from_world, self.rig);
         visible.iter().for_each(|p| self.map.landmarks[p.point].observable += 1);
-        visible.retain(|p| !matched[p.point]);
+        visible.retain(|p| matched.binary_search(&p.point).is_err());
         let radius = |p: &Projection| {
             let base = if p.view_cosine > STRAIGHT_COSINE { MAP_RADIUS_STRAIGHT } else { MAP_RADIUS_OBLIQUE };
             base * if start.rough { ROUGH_FACTOR } else { 1.0 }
@@ -165,8 +165,7 @@ impl Context<'_> {
         let search = ProjectionSearch { taken: &taken, coarser_octaves: 0, rules: MAP_RULES };
         let found = search.run(frame, &visible, radius, self.rig);
         pairs.extend(found.iter().map(|m| (m.point, m.feature)));
-        let mut found =
-            self.optimise_over(frame, &start.camera_from_world, &pairs, |l| Some(self.map.landmarks[l].position), Some);
+        let mut found = self.optimise_over(frame, &start.camera_from_world, &pairs, |l| Some(self.map.position(l)), Some);
         found.rough = start.rough;
         for l in found.landmarks.iter().flatten() {
             self.map.landmarks[*l].observed += 1;
@@ -182,7 +181,7 @@ impl Context<'_> {
         let mut landmarks = found.landmarks;
         for (feature, landmark) in landmarks.iter_mut().enumerate() {
             let agrees = |l: &usize| {
-                let p_in_camera = (camera_from_world * self.map.landmarks[*l].position).coords;
+                let p_in_camera = (camera_from_world * self.map.position(*l)).coords;
                 frame.features[feature].measurement(&self.rig.config).classify(&self.rig.pinhole, &p_in_camera)
                     != InlierClass::Outlier
             };

@@ -1,19 +1,20 @@
 //! What a closed loop does to the map: the drift is spread over the keyframes by a pose graph, landmarks follow the keyframe that saw
 //! them first, and what turned out to be the same is joined (Mur-Artal, Montiel & Tardós, *ORB-SLAM*, 2015: the *essential graph*). The
-//! bundle adjustment of all keyframes that settles the rest is up to the caller.
+//! bundle adjustment that settles the rest is up to the caller.
+
+use std::collections::BTreeMap;
 
 use crate::geometry::sim3::Vector7;
 use crate::geometry::{Se3, Sim3};
 use crate::tracking::TrackingConfig;
 use crate::tracking::loop_closing::detection::{CONNECTED_SHARED, Recognised};
 use crate::tracking::map::insertion::fuse;
-use crate::tracking::map::sparse_map::{LandmarkState, Map, Observation};
+use crate::tracking::map::sparse_map::{Map, Observation};
 use crate::tracking::rig::Rig;
 use crate::tracking::solvers::pose_graph::{Edge, PoseGraph};
 
 /// Keyframes that share this many landmarks are held to their relative pose, besides each one and the one it shares most with.
 const STRONG_SHARED: usize = 100;
-const STRONG_NEIGHBOURS: usize = 5;
 /// Standard deviation of the relative pose of two keyframes that share [`STRONG_SHARED`] landmarks, metres at a metre's distance and
 /// radians, and of the logarithm of their scales. Only their ratios matter, and how they compare with [`HUBER_SIGMAS`].
 const SIGMA_TRANSLATION: f64 = 0.003;
@@ -34,70 +35,143 @@ pub struct MovedKeyframe {
     pub growth: f64,
 }
 
-/// Closes a recognised loop; `edges` are those of earlier loops and get this one's. Returns the keyframes that may have moved.
-pub fn correct(map: &mut Map, found: &Recognised, edges: &mut Vec<Edge>, scale_is_free: bool, rig: &Rig) -> Vec<MovedKeyframe> {
-    let config = &rig.config;
-    let before: Vec<Se3> = map.keyframes.iter().map(|k| k.camera_from_world).collect();
-    let keyframe_from_place = found.corrected * Sim3::from(before[found.place]).inverse();
-    let depth = map.keyframes[found.keyframe].features.median_depth().or_else(|| map.median_depth(found.keyframe)).unwrap_or(1.0);
-    edges.push(Edge {
-        huber: Some(HUBER_SIGMAS),
-        ..edge(found.keyframe, found.place, keyframe_from_place, found.matches.len(), depth)
-    });
-    let poses: Vec<Sim3> = before.iter().map(|p| Sim3::from(*p)).collect();
-    let after = if map.connects(found.keyframe, found.place) {
-        let mut graph = PoseGraph { poses, edges: skeleton(map, depth), scale_is_free };
-        graph.edges.extend(edges.iter());
-        graph.optimise(GRAPH_STEPS);
-        graph.poses
-    } else {
-        join(map, found, poses)
-    };
-    move_map(map, &before, &after, config);
-    let living: Vec<usize> = (0..before.len()).map(|k| map.living(k)).collect();
-    let growth = |k: usize| 1.0 / after[living[k]].scale;
-    map.culled.iter_mut().for_each(|(k, held)| held.camera_from_parent.translation.vector *= growth(*k));
-    map.carry_culled();
-    let neighbours: Vec<usize> =
-        map.covisible(found.keyframe).into_iter().filter(|(_, n)| *n >= CONNECTED_SHARED).map(|(k, _)| k).collect();
-    take_over(map, found, config);
-    fuse(map, found.keyframe, &found.landmarks, rig);
-    for neighbour in neighbours.into_iter().take(FUSED_NEIGHBOURS) {
-        fuse(map, neighbour, &found.landmarks, rig);
-    }
-    let moved = (1..after.len()).filter(|k| after[living[*k]] != Sim3::from(before[living[*k]]));
-    moved.map(|k| MovedKeyframe { keyframe: k, growth: growth(k) }).collect()
+/// A correction of the map: made of it, solved beside tracking, and taken into the map, which has gone on meanwhile.
+#[derive(Clone, Debug)]
+pub struct Correction {
+    found: Recognised,
+    /// A pose for each keyframe, and the poses before.
+    keyframes: Vec<usize>,
+    before: Vec<Se3>,
+    graph: PoseGraph,
+    /// Keyframes in the map when it was made.
+    known: usize,
 }
 
-/// Makes one submap of two that show the same place: the younger moves as a whole to where the older shows it. Returns all poses after it.
-fn join(map: &mut Map, found: &Recognised, mut poses: Vec<Sim3>) -> Vec<Sim3> {
-    let (current, place) = (map.keyframes[found.keyframe].root, map.keyframes[found.place].root);
-    // Where the place's submap lies in that of the keyframe.
-    let current_from_place = poses[found.keyframe].inverse() * found.corrected;
-    let (older, younger) = (current.min(place), current.max(place));
-    let younger_from_older = if younger == current { current_from_place } else { current_from_place.inverse() };
-    for (keyframe, pose) in map.keyframes.iter_mut().zip(&mut poses).filter(|(k, _)| k.root == younger) {
-        keyframe.root = older;
-        *pose = *pose * younger_from_older;
+impl Correction {
+    /// Spreads the drift that a loop shows over its submap; `edges` are those of all loops, this one's the last.
+    pub fn of_loop(map: &Map, found: Recognised, edges: &[Edge], scale_is_free: bool) -> Self {
+        let keyframes: Vec<usize> = map.living_in(map.keyframes[found.keyframe].root).collect();
+        let before: Vec<Se3> = keyframes.iter().map(|k| map.keyframes[*k].camera_from_world).collect();
+        let depth = depth_around(map, found.keyframe);
+        let place = |k: usize| keyframes.binary_search(&map.living(k)).ok();
+        let mut graph = PoseGraph { poses: before.iter().map(|p| Sim3::from(*p)).collect(), edges: Vec::new(), scale_is_free };
+        for (a, keyframe) in keyframes.iter().enumerate().skip(1) {
+            let mut older: Vec<(usize, usize)> = Vec::new();
+            for (other, shared) in &map.keyframes[*keyframe].links {
+                // What a culled keyframe shared, the one that carries it shares.
+                let link = place(*other).filter(|b| *b < a && older.iter().all(|(known, _)| known != b));
+                older.extend(link.map(|b| (b, *shared)));
+            }
+            let parent = older.first().copied().unwrap_or((a - 1, 1));
+            let strong = older.into_iter().skip(1).filter(|(_, shared)| *shared >= STRONG_SHARED);
+            for (b, shared) in std::iter::once(parent).chain(strong) {
+                graph.edges.push(edge(a, b, Sim3::from(before[a] * before[b].inverse()), shared, depth));
+            }
+        }
+        // Edges of other submaps have no place.
+        graph.edges.extend(edges.iter().filter_map(|e| Some(Edge { a: place(e.a)?, b: place(e.b)?, ..*e })));
+        Self { found, keyframes, before, graph, known: map.keyframes.len() }
     }
-    poses
-}
 
-/// The edges that hold the map together: each keyframe with the older one that it shares most with, and with others if that is much.
-fn skeleton(map: &Map, depth: f64) -> Vec<Edge> {
-    let mut edges = Vec::new();
-    let mut last = 0;
-    for a in (1..map.keyframes.len()).filter(|k| !map.culled.contains_key(k)) {
-        let older: Vec<(usize, usize)> = map.covisible(a).into_iter().filter(|(b, _)| *b < a).take(STRONG_NEIGHBOURS).collect();
-        let (parent, shared) = older.first().copied().unwrap_or((last, 1));
-        last = a;
-        let strong = older.into_iter().skip(1).filter(|(_, shared)| *shared >= STRONG_SHARED);
-        for (b, shared) in std::iter::once((parent, shared)).chain(strong) {
-            let a_from_b = map.keyframes[a].camera_from_world * map.keyframes[b].camera_from_world.inverse();
-            edges.push(edge(a, b, Sim3::from(a_from_b), shared, depth));
+    /// Makes one submap of two that show the same place: the younger moves as a whole to where the older shows it.
+    pub fn of_submaps(map: &mut Map, found: Recognised) -> Self {
+        let (current, place) = (map.keyframes[found.keyframe].root, map.keyframes[found.place].root);
+        // Where the place's submap lies in that of the keyframe.
+        let current_from_place = Sim3::from(map.keyframes[found.keyframe].camera_from_world).inverse() * found.corrected;
+        let (older, younger) = (current.min(place), current.max(place));
+        let younger_from_older = if younger == current { current_from_place } else { current_from_place.inverse() };
+        let keyframes: Vec<usize> = map.living_in(younger).collect();
+        let before: Vec<Se3> = keyframes.iter().map(|k| map.keyframes[*k].camera_from_world).collect();
+        let poses = before.iter().map(|p| Sim3::from(*p) * younger_from_older).collect();
+        for keyframe in map.keyframes.iter_mut().filter(|k| k.root == younger) {
+            keyframe.root = older;
+        }
+        map.roots.remove(&younger);
+        Self { found, keyframes, before, graph: PoseGraph { poses, ..Default::default() }, known: map.keyframes.len() }
+    }
+
+    /// Whether there is nothing to solve.
+    pub fn is_solved(&self) -> bool {
+        self.graph.edges.is_empty()
+    }
+
+    /// Number of keyframes in the pose graph.
+    pub fn size(&self) -> usize {
+        self.keyframes.len()
+    }
+
+    /// Optimises the pose graph.
+    pub fn solve(&mut self) {
+        self.graph.optimise(GRAPH_STEPS);
+    }
+
+    /// Takes the result into the map; `edges` follow what they were measured in. Keyframes that came since go with the newest of those
+    /// before. Returns the keyframes that may have moved, in ascending order.
+    pub fn apply(&self, map: &mut Map, edges: &mut [Edge], rig: &Rig) -> Vec<MovedKeyframe> {
+        let mut grown: BTreeMap<usize, f64> = BTreeMap::new();
+        let mut newest = None;
+        for ((keyframe, before), after) in self.keyframes.iter().zip(&self.before).zip(&self.graph.poses) {
+            let before = Sim3::from(*before);
+            newest = Some((before, *after));
+            if !map.culled.contains_key(keyframe) && *after != before {
+                move_keyframe(map, *keyframe, &before, after, &mut grown);
+            }
+        }
+        let root = self.keyframes.first().map(|k| map.keyframes[*k].root);
+        if let Some((before, after)) = newest.filter(|(before, after)| before != after) {
+            for keyframe in self.known..map.keyframes.len() {
+                if Some(map.keyframes[keyframe].root) == root && !map.culled.contains_key(&keyframe) {
+                    move_keyframe(map, keyframe, &before, &after, &mut grown);
+                }
+            }
+        }
+        for edge in edges {
+            let growth = |k: usize| grown.get(&k).copied().unwrap_or(1.0);
+            edge.a_from_b.translation *= growth(edge.a);
+            edge.a_from_b.scale *= growth(edge.a) / growth(edge.b);
+        }
+        map.corrections += 1;
+        self.fuse(map, rig);
+        grown.into_iter().map(|(keyframe, growth)| MovedKeyframe { keyframe, growth }).collect()
+    }
+
+    /// Joins the place's landmarks with those of the keyframe, of its neighbours, and of the newest ones, which have seen it since.
+    fn fuse(&self, map: &mut Map, rig: &Rig) {
+        let keyframe = self.found.keyframe;
+        let connected = map.covisible(keyframe).into_iter().filter(|(_, shared)| *shared >= CONNECTED_SHARED);
+        let mut around: Vec<usize> = connected.map(|(k, _)| k).take(FUSED_NEIGHBOURS).collect();
+        let since = (self.known..map.keyframes.len()).rev().take(FUSED_NEIGHBOURS);
+        let lives = |k: &usize| !map.culled.contains_key(k) && map.connects(*k, keyframe);
+        let since: Vec<usize> = since.filter(|k| lives(k) && !around.contains(k)).collect();
+        around.extend(since);
+        take_over(map, &self.found, &rig.config);
+        for keyframe in std::iter::once(keyframe).chain(around) {
+            fuse(map, keyframe, &self.found.landmarks, rig);
         }
     }
-    edges
+}
+
+/// Moves a keyframe, with what hangs on it, as one that was at `before` has moved to `after`.
+fn move_keyframe(map: &mut Map, keyframe: usize, before: &Sim3, after: &Sim3, grown: &mut BTreeMap<usize, f64>) {
+    let pose = Sim3::from(map.keyframes[keyframe].camera_from_world) * before.inverse() * *after;
+    let growth = 1.0 / pose.scale;
+    for k in map.with_carried(keyframe).collect::<Vec<_>>() {
+        map.keyframes[k].unit *= growth;
+        grown.insert(k, growth);
+    }
+    map.set_pose(keyframe, pose.to_rigid());
+}
+
+/// The edge of a recognised place.
+pub fn loop_edge(map: &Map, found: &Recognised) -> Edge {
+    let keyframe_from_place = found.corrected * Sim3::from(map.keyframes[found.place].camera_from_world).inverse();
+    let depth = depth_around(map, found.keyframe);
+    Edge { huber: Some(HUBER_SIGMAS), ..edge(found.keyframe, found.place, keyframe_from_place, found.matches.len(), depth) }
+}
+
+/// Median depth of what a keyframe sees, metres.
+fn depth_around(map: &Map, keyframe: usize) -> f64 {
+    map.keyframes[keyframe].features.median_depth().or_else(|| map.median_depth(keyframe)).unwrap_or(1.0)
 }
 
 fn edge(a: usize, b: usize, a_from_b: Sim3, shared: usize, depth: f64) -> Edge {
@@ -105,20 +179,6 @@ fn edge(a: usize, b: usize, a_from_b: Sim3, shared: usize, depth: f64) -> Edge {
     let (t, r) = (certainty / (SIGMA_TRANSLATION * depth), certainty / SIGMA_ROTATION_RAD);
     let weights = Vector7::from_column_slice(&[t, t, t, r, r, r, certainty / SIGMA_SCALE]);
     Edge { a, b, a_from_b, weights, huber: None }
-}
-
-/// Keyframes to their new poses; each landmark goes with the keyframe that saw it first.
-fn move_map(map: &mut Map, before: &[Se3], after: &[Sim3], config: &TrackingConfig) {
-    for landmark in map.landmarks.iter_mut().filter(|l| l.state == LandmarkState::Alive) {
-        let Some(anchor) = landmark.observations.first().map(|s| s.keyframe) else { continue };
-        landmark.position = after[anchor].inverse().act(&(before[anchor] * landmark.position));
-    }
-    for (keyframe, pose) in map.keyframes.iter_mut().zip(after) {
-        keyframe.camera_from_world = pose.to_rigid();
-    }
-    for l in 0..map.landmarks.len() {
-        map.refresh_geometry(l, config);
-    }
 }
 
 /// The place's landmarks take over what the keyframe's features showed.

@@ -146,7 +146,7 @@ impl Search<'_> {
 
     /// The point that a feature shows: its landmark, or where its depth was measured.
     fn point_in_camera(&self, keyframe: &Keyframe, feature: usize) -> Option<Point3<f64>> {
-        let landmark = keyframe.landmarks[feature].map(|l| keyframe.camera_from_world * self.map.landmarks[l].position);
+        let landmark = keyframe.landmarks[feature].map(|l| keyframe.camera_from_world * self.map.position(l));
         landmark.or_else(|| keyframe.features.point_in_camera(feature, &self.rig.pinhole))
     }
 
@@ -174,7 +174,7 @@ impl Search<'_> {
         let visible = self.map.visible(landmarks.iter().copied(), camera_from_world, self.rig);
         let found = PROJECTION_SEARCH.run(features, &visible, |_| PROJECTION_RADIUS, self.rig);
         let observation = |m: &PointMatch| PoseObservation {
-            point_in_world: self.map.landmarks[m.point].position,
+            point_in_world: self.map.position(m.point),
             measurement: features.features[m.feature].measurement(&self.rig.config),
         };
         let observations: Vec<PoseObservation> = found.iter().map(observation).collect();
@@ -191,14 +191,8 @@ impl Search<'_> {
         }
         let current = self.map.keyframes[keyframe].camera_from_world;
         let off = corrected.to_rigid().inverse() * current;
-        let centre = |k: usize| self.map.keyframes[k].centre();
-        let steps = (place..keyframe).map(|k| (k, k + 1));
-        let path_metres: f64 = steps.clone().map(|(a, b)| (centre(b) - centre(a)).norm()).sum();
-        let turn = |(a, b): (usize, usize)| {
-            let pose = |k: usize| self.map.keyframes[k].camera_from_world.rotation;
-            pose(a).angle_to(&pose(b))
-        };
-        let rotation_rad: f64 = steps.map(turn).sum();
+        let (here, there) = (&self.map.keyframes[keyframe].travelled, &self.map.keyframes[place].travelled);
+        let (path_metres, rotation_rad) = ((here.metres - there.metres).abs(), (here.radians - there.radians).abs());
         let shift = (current.inverse().translation.vector - corrected.to_rigid().inverse().translation.vector).norm();
         let grown = corrected.scale.max(1.0 / corrected.scale);
         shift <= DRIFT_METRES + MAX_DRIFT_SHARE * path_metres

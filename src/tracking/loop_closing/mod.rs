@@ -9,8 +9,8 @@ use crate::geometry::Se3;
 use crate::tracking::map::Map;
 use crate::tracking::rig::Rig;
 use crate::tracking::solvers::pose_graph::Edge;
-pub use correction::MovedKeyframe;
-use correction::correct;
+use correction::loop_edge;
+pub use correction::{Correction, MovedKeyframe};
 use detection::{Search, knows_scale};
 
 /// Least keyframes between two closed loops.
@@ -37,22 +37,31 @@ pub struct LoopCloser {
 }
 
 impl LoopCloser {
-    /// Closes a loop if `keyframe`, one of the newest, shows a place left long ago, or joins its submap with another that shows the place.
-    /// Returns the keyframes that moved, in ascending order; none if no place was recognised.
-    pub fn close(&mut self, map: &mut Map, keyframe: usize, rig: &Rig) -> Vec<MovedKeyframe> {
+    /// The correction that follows if `keyframe`, one of the newest, shows a place left long ago, or one of another submap; it is still to
+    /// be solved and taken into the map.
+    pub fn recognise(&mut self, map: &mut Map, keyframe: usize, rig: &Rig) -> Option<Correction> {
         let rests = self.last.is_some_and(|last| keyframe < last + REST);
         if rests && map.is_connected() {
-            return Vec::new();
+            return None;
         }
         let search = Search { map, rig, scale_is_free: !knows_scale(map) };
         let places = search.candidates(keyframe).into_iter().filter(|place| !rests || !map.connects(keyframe, *place));
-        let recognised = places.into_iter().find_map(|place| search.recognise(keyframe, place));
-        let Some(recognised) = recognised else { return Vec::new() };
+        let recognised = places.into_iter().find_map(|place| search.recognise(keyframe, place))?;
         let scale_is_free = search.scale_is_free;
         self.last = Some(keyframe);
-        let kind = if map.connects(keyframe, recognised.place) { "loop closed" } else { "submaps joined" };
+        self.edges.push(loop_edge(map, &recognised));
+        let in_one_submap = map.connects(keyframe, recognised.place);
+        let kind = if in_one_submap { "loop closed" } else { "submaps joined" };
         tracing::info!(keyframe, place = recognised.place, landmarks = recognised.matches.len(), "{kind}");
-        correct(map, &recognised, &mut self.edges, scale_is_free, rig)
+        Some(match in_one_submap {
+            true => Correction::of_loop(map, recognised, &self.edges, scale_is_free),
+            false => Correction::of_submaps(map, recognised),
+        })
+    }
+
+    /// Takes a solved correction into the map; returns the keyframes that may have moved, in ascending order.
+    pub fn apply(&mut self, correction: &Correction, map: &mut Map, rig: &Rig) -> Vec<MovedKeyframe> {
+        correction.apply(map, &mut self.edges, rig)
     }
 
     /// All loops, in the order in which they were closed.

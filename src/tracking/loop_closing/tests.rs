@@ -10,7 +10,7 @@ use crate::tracking::TrackingConfig;
 use crate::tracking::adjustment::local_bundle::Adjustment;
 use crate::tracking::features::descriptor::Descriptor;
 use crate::tracking::features::frame_features::{Feature, FrameFeatures};
-use crate::tracking::loop_closing::LoopCloser;
+use crate::tracking::loop_closing::{LoopCloser, MovedKeyframe};
 use crate::tracking::map::sparse_map::{Keyframe, Map, Observation};
 use crate::tracking::rig::Rig;
 use crate::tracking::solvers::residual::tests::PINHOLE;
@@ -61,15 +61,8 @@ pub(crate) fn drifted(step: &Sim3, with_depth: bool, config: &TrackingConfig) ->
             drifted = *step * Sim3::from(station(id) * station(id - 1).inverse()) * drifted;
         }
         let (features, points) = view(id, &wall, with_depth);
-        map.database.insert(id, &features);
-        map.keyframes.push(Keyframe {
-            root: 0,
-            frame_index: id,
-            timestamp_s: id as f64,
-            camera_from_world: drifted.to_rigid(),
-            landmarks: vec![None; features.len()],
-            features: Arc::new(FrameFeatures::new(features, &PINHOLE)),
-        });
+        let features = Arc::new(FrameFeatures::new(features, &PINHOLE));
+        map.push(Keyframe::new(id, id as f64, drifted.to_rigid(), features));
         for (feature, point) in points.into_iter().enumerate() {
             let observation = Observation { keyframe: id, feature };
             match known[point].filter(|(_, last)| last + 3 > id) {
@@ -85,7 +78,16 @@ pub(crate) fn drifted(step: &Sim3, with_depth: bool, config: &TrackingConfig) ->
         }
     }
     (0..map.landmarks.len()).for_each(|l| map.refresh_geometry(l, config));
+    (0..map.keyframes.len()).for_each(|k| map.refresh_links(k));
     map
+}
+
+/// Closes a loop at once.
+fn close(closer: &mut LoopCloser, map: &mut Map, keyframe: usize, config: &TrackingConfig) -> Vec<MovedKeyframe> {
+    let rig = Rig { pinhole: PINHOLE, config: config.clone() };
+    let Some(mut correction) = closer.recognise(map, keyframe, &rig) else { return Vec::new() };
+    correction.solve();
+    closer.apply(&correction, map, &rig)
 }
 
 /// Largest distance between a keyframe's centre and its true one, metres, after alignment (with scale where it is free).
@@ -105,8 +107,8 @@ fn a_loop_is_closed_with_and_without_scale() {
         let (newest, before) = (map.keyframes.len() - 1, off_metres(&map, !with_depth));
         assert!(before > 0.1 && map.covisible(newest).iter().all(|(k, _)| *k > 20), "{before} m");
         let mut again = map.clone();
-        let moved = LoopCloser::default().close(&mut map, newest, &Rig { pinhole: PINHOLE, config: config.clone() });
-        let mut all = Adjustment::of_all(&map, &config).unwrap();
+        let moved = close(&mut LoopCloser::default(), &mut map, newest, &config);
+        let mut all = Adjustment::of_all(&map, 0, &config).unwrap();
         all.solve(&PINHOLE, config.bundle_iterations);
         all.apply(&mut map, &config);
         assert_eq!(moved.iter().map(|m| m.keyframe).collect::<Vec<_>>(), (1..=newest).collect::<Vec<_>>());
@@ -115,7 +117,7 @@ fn a_loop_is_closed_with_and_without_scale() {
         assert!(after < 0.25 * before, "{before} m → {after} m with depth: {with_depth}");
         assert!(map.covisible(newest).iter().any(|(k, shared)| *k < 10 && *shared > 50), "both ends of the loop are joined");
 
-        LoopCloser::default().close(&mut again, newest, &Rig { pinhole: PINHOLE, config: config.clone() });
+        close(&mut LoopCloser::default(), &mut again, newest, &config);
         all.apply(&mut again, &config);
         assert_eq!(again.keyframes[newest].camera_from_world, map.keyframes[newest].camera_from_world);
     }
@@ -127,28 +129,27 @@ fn no_loop_is_seen_where_there_is_none() {
     let mut map = drifted(&Sim3::identity(), true, &config);
     let mut closer = LoopCloser::default();
     // Half way round; and a drift that nobody would believe.
-    assert!(closer.close(&mut map, STATIONS / 2, &Rig { pinhole: PINHOLE, config: config.clone() }).is_empty());
+    assert!(close(&mut closer, &mut map, STATIONS / 2, &config).is_empty());
     let newest = map.keyframes.len() - 1;
     for keyframe in &mut map.keyframes[STATIONS - 4..] {
         keyframe.camera_from_world = Se3::translation(30.0, 0.0, 0.0) * keyframe.camera_from_world;
     }
-    assert!(closer.close(&mut map, newest, &Rig { pinhole: PINHOLE, config: config.clone() }).is_empty());
+    assert!(close(&mut closer, &mut map, newest, &config).is_empty());
 }
 
 #[test]
 fn submaps_that_show_one_place_become_one() {
     let config = TrackingConfig::default();
-    let rig = Rig { pinhole: PINHOLE, config: config.clone() };
     for (scale, with_depth) in [(1.0, true), (1.25, false)] {
         let mut map = drifted(&Sim3::identity(), with_depth, &config);
         let first = map.keyframes.len();
         let mut again = drifted(&Sim3::identity(), with_depth, &config);
         again.keyframes.iter_mut().for_each(|k| k.camera_from_world.translation.vector *= scale);
-        again.landmarks.iter_mut().for_each(|l| l.position.coords *= scale);
+        again.landmarks.iter_mut().for_each(|l| l.in_anchor.coords *= scale);
         map.append(again, &Se3::new(Vector3::new(300.0, 2.0, 1.0), Vector3::new(0.1, 0.3, 0.2)), &config);
         let newest = map.keyframes.len() - 1;
         assert!(!map.is_connected() && map.is_root(first) && map.connects(first, newest) && !map.connects(0, newest));
-        let moved = LoopCloser::default().close(&mut map, newest, &rig);
+        let moved = close(&mut LoopCloser::default(), &mut map, newest, &config);
         assert_eq!(moved.iter().map(|m| m.keyframe).collect::<Vec<_>>(), (first..=newest).collect::<Vec<_>>());
         assert!(moved.iter().all(|m| (m.growth * scale - 1.0).abs() < 0.01));
         assert!(map.is_connected());

@@ -24,13 +24,10 @@ const MIN_OBSERVED_SHARE: f64 = 0.25;
 /// Puts a keyframe in the map with the landmarks that its frame was tracked by; makes new ones from depth. Returns its id.
 pub fn insert_keyframe(map: &mut Map, mut keyframe: Keyframe, rig: &Rig) -> usize {
     let Rig { pinhole, config } = rig;
-    let id = map.keyframes.len();
-    let tracked = std::mem::take(&mut keyframe.landmarks);
     let features = keyframe.features.clone();
+    let tracked = std::mem::replace(&mut keyframe.landmarks, vec![None; features.len()]);
     let world_from_camera = keyframe.camera_from_world.inverse();
-    keyframe.landmarks = vec![None; features.len()];
-    map.keyframes.push(keyframe);
-    map.database.insert(id, &features.features);
+    let id = map.push(keyframe);
     for (feature, landmark) in tracked.into_iter().enumerate() {
         if let Some(landmark) = landmark.and_then(|l| map.resolve(l)) {
             map.add_observation(landmark, Observation { keyframe: id, feature });
@@ -67,7 +64,7 @@ pub fn fuse(map: &mut Map, keyframe: usize, landmarks: &[usize], rig: &Rig) {
     let features = target.features.clone();
     let mut changed = BTreeSet::new();
     for PointMatch { point: landmark, feature } in FUSE_SEARCH.run(&features, &visible, |_| FUSE_RADIUS, rig) {
-        let p_in_camera = (map.keyframes[keyframe].camera_from_world * map.landmarks[landmark].position).coords;
+        let p_in_camera = (map.keyframes[keyframe].camera_from_world * map.position(landmark)).coords;
         if features.features[feature].measurement(config).classify(pinhole, &p_in_camera) == InlierClass::Outlier {
             continue;
         }
@@ -92,14 +89,16 @@ pub fn fuse(map: &mut Map, keyframe: usize, landmarks: &[usize], rig: &Rig) {
 
 /// Removes landmarks that ended their probation badly, and those rarely found where they should be.
 pub fn cull_recent_landmarks(map: &mut Map, newest_keyframe: usize) {
-    for l in 0..map.landmarks.len() {
+    // Landmarks are in the order in which keyframes made them.
+    let on_probation = map.landmarks.partition_point(|l| l.first_keyframe + RECENT_KEYFRAMES < newest_keyframe);
+    for l in on_probation..map.landmarks.len() {
         let landmark = &map.landmarks[l];
         let age = newest_keyframe - landmark.first_keyframe;
         let rarely_found = f64::from(landmark.observed) < MIN_OBSERVED_SHARE * f64::from(landmark.observable);
         let measured =
             landmark.observations.iter().any(|s| map.keyframes[s.keyframe].features.features[s.feature].depth_metres.is_some());
         let alone = age == RECENT_KEYFRAMES && landmark.observations.len() < if measured { 2 } else { 3 };
-        if landmark.state == LandmarkState::Alive && (alone || (age <= RECENT_KEYFRAMES && rarely_found)) {
+        if landmark.state == LandmarkState::Alive && (alone || rarely_found) {
             map.remove_landmark(l);
         }
     }

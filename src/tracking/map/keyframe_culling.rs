@@ -8,7 +8,7 @@ use std::sync::Arc;
 
 use crate::tracking::TrackingConfig;
 use crate::tracking::features::frame_features::FrameFeatures;
-use crate::tracking::map::sparse_map::{CulledKeyframe, LandmarkState, Map, Observation};
+use crate::tracking::map::sparse_map::{Map, Observation};
 
 /// Share of a keyframe's landmarks that must be seen elsewhere, and by how many other keyframes.
 const REDUNDANT_SHARE: f64 = 0.9;
@@ -53,23 +53,15 @@ fn is_redundant(map: &Map, keyframe: usize) -> bool {
 /// Culls a keyframe; `false` if no other could be its parent.
 fn cull(map: &mut Map, keyframe: usize, config: &TrackingConfig) -> bool {
     let Some((parent, _)) = map.covisible(keyframe).first().copied() else { return false };
-    let pose = |map: &Map, k: usize| map.keyframes[k].camera_from_world;
-    let camera_from_parent = pose(map, keyframe) * pose(map, parent).inverse();
-    for (feature, landmark) in std::mem::take(&mut map.keyframes[keyframe].landmarks).into_iter().enumerate() {
+    for (feature, landmark) in map.keyframes[keyframe].landmarks.clone().into_iter().enumerate() {
         let Some(landmark) = landmark else { continue };
-        map.landmarks[landmark].observations.retain(|s| *s != Observation { keyframe, feature });
-        if map.landmarks[landmark].observations.is_empty() {
-            map.landmarks[landmark].state = LandmarkState::Removed;
-        }
+        map.remove_observation(landmark, Observation { keyframe, feature });
         map.refresh_geometry(landmark, config);
     }
+    map.keyframes[keyframe].landmarks = Vec::new();
     let features = std::mem::replace(&mut map.keyframes[keyframe].features, Arc::new(FrameFeatures::default()));
     map.database.remove(keyframe, &features.features);
-    // Its own culled keyframes get its parent.
-    for held in map.culled.values_mut().filter(|held| held.parent == keyframe) {
-        *held = CulledKeyframe { parent, camera_from_parent: held.camera_from_parent * camera_from_parent };
-    }
-    map.culled.insert(keyframe, CulledKeyframe { parent, camera_from_parent });
+    map.attach(keyframe, parent);
     true
 }
 
@@ -97,15 +89,9 @@ mod tests {
                     feature
                 })
                 .collect();
-            map.database.insert(id as usize, &features);
-            map.keyframes.push(Keyframe {
-                root: 0,
-                frame_index: id as usize,
-                timestamp_s: t,
-                camera_from_world: se3::exp(&Vector6::new(t, 0.0, 0.0, 0.0, 0.1 * t, 0.0)),
-                landmarks: vec![None; features.len()],
-                features: Arc::new(FrameFeatures::new(features, &PINHOLE)),
-            });
+            let camera_from_world = se3::exp(&Vector6::new(t, 0.0, 0.0, 0.0, 0.1 * t, 0.0));
+            let features = Arc::new(FrameFeatures::new(features, &PINHOLE));
+            map.push(Keyframe::new(id as usize, t, camera_from_world, features));
             for feature in 0..LANDMARKS {
                 let observation = Observation { keyframe: id as usize, feature };
                 if id == 0 {
@@ -148,10 +134,9 @@ mod tests {
         assert!(map.landmarks.iter().all(|l| l.observations.iter().all(|s| !map.culled.contains_key(&s.keyframe))));
         assert!(map.culled.values().all(|held| !map.culled.contains_key(&held.parent)), "nobody is held by one that is held");
         let push = se3::exp(&Vector6::new(0.3, -0.1, 0.2, 0.2, 0.1, 0.4));
-        for k in 0..12 {
-            map.keyframes[k].camera_from_world *= push;
+        for k in (0..12).filter(|k| !map.culled.contains_key(k)).collect::<Vec<_>>() {
+            map.set_pose(k, map.keyframes[k].camera_from_world * push);
         }
-        map.carry_culled();
         for (k, pose) in poses.iter().enumerate() {
             assert!(se3::log(&(map.keyframes[k].camera_from_world * (pose * push).inverse())).norm() < 1e-9, "{k}");
         }

@@ -7,6 +7,7 @@
 
 use crate::tracking::features::descriptor::Descriptor;
 use crate::tracking::features::frame_features::Feature;
+use crate::tracking::map::tally::{distinct, tally};
 
 /// Descriptors in a leaf before it is split.
 const LEAF_CAPACITY: usize = 32;
@@ -80,22 +81,15 @@ impl KeyframeDatabase {
 
     /// The keyframes that show some of these features, most alike first, then newest first.
     pub fn query(&self, features: &[Feature]) -> Vec<Similarity> {
-        let mut covisibility = vec![0usize; self.features.len()];
-        // The last query feature that voted for a keyframe, counted from 1: each has one vote for it.
-        let mut voted = vec![0usize; self.features.len()];
-        for (index, feature) in features.iter().enumerate() {
-            let Node::Leaf(entries) = &self.nodes[self.leaf(&feature.descriptor)] else { continue };
-            for entry in entries {
-                let keyframe = entry.keyframe as usize;
-                if voted[keyframe] != index + 1 && entry.descriptor.distance(&feature.descriptor) <= MAX_DISTANCE {
-                    voted[keyframe] = index + 1;
-                    covisibility[keyframe] += 1;
-                }
-            }
-        }
-        let score = |keyframe: usize| covisibility[keyframe] as f64 / self.features[keyframe].max(features.len()) as f64;
-        let found = (0..covisibility.len()).filter(|k| covisibility[*k] > 0);
-        let mut ranked: Vec<Similarity> = found.map(|keyframe| Similarity { keyframe, score: score(keyframe) }).collect();
+        // Each feature has one vote for a keyframe.
+        let votes = features.iter().flat_map(|feature| {
+            let Node::Leaf(entries) = &self.nodes[self.leaf(&feature.descriptor)] else { return Vec::new() };
+            let alike = entries.iter().filter(|entry| entry.descriptor.distance(&feature.descriptor) <= MAX_DISTANCE);
+            distinct(alike.map(|entry| entry.keyframe as usize))
+        });
+        let score = |keyframe: usize, votes: usize| votes as f64 / self.features[keyframe].max(features.len()) as f64;
+        let similarity = |(keyframe, votes)| Similarity { keyframe, score: score(keyframe, votes) };
+        let mut ranked: Vec<Similarity> = tally(votes).into_iter().map(similarity).collect();
         ranked.sort_by(|a, b| b.score.total_cmp(&a.score).then(b.keyframe.cmp(&a.keyframe)));
         ranked
     }

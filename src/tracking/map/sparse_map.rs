@@ -1,19 +1,21 @@
 //! The sparse map: keyframes, landmarks, who sees what, and the covisibility that follows from it.
 //!
 //! Everything is indexed by its place in a `Vec` (ids never change and are never reused), so every walk has one order. A culled keyframe
-//! keeps its place and its pose, and nothing else.
+//! keeps its place and its pose, and nothing else. No walk but a correction's is over all of them: what a frame or a keyframe costs depends on what
+//! it sees.
 
-use std::collections::BTreeMap;
-use std::sync::Arc;
+use std::collections::{BTreeMap, BTreeSet};
 
 use nalgebra::{Point3, Vector3};
 
 use crate::geometry::Se3;
 use crate::tracking::TrackingConfig;
 use crate::tracking::features::descriptor::{Descriptor, representative};
-use crate::tracking::features::frame_features::FrameFeatures;
 use crate::tracking::features::projection::Projection;
+pub use crate::tracking::map::keyframe::{CulledKeyframe, Keyframe};
 use crate::tracking::map::keyframe_database::KeyframeDatabase;
+pub use crate::tracking::map::landmark::{Landmark, LandmarkState, Observation};
+use crate::tracking::map::tally::{distinct, tally};
 use crate::tracking::rig::Rig;
 
 /// A landmark is looked for only within 60° of the mean direction from which it was seen.
@@ -22,60 +24,8 @@ const MIN_VIEW_COSINE: f64 = 0.5;
 const RANGE_SLACK: f64 = 1.2;
 /// A landmark's descriptor is chosen among those of its latest observations.
 const DESCRIPTORS_COMPARED: usize = 10;
-
-/// Feature `feature` of keyframe `keyframe` shows a landmark.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Observation {
-    pub keyframe: usize,
-    pub feature: usize,
-}
-
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum LandmarkState {
-    Alive,
-    Removed,
-    /// It turned out to be another landmark.
-    MergedInto(usize),
-}
-
-#[derive(Clone, Debug)]
-pub struct Landmark {
-    /// In the world, metres.
-    pub position: Point3<f64>,
-    pub descriptor: Descriptor,
-    /// Mean direction from the cameras to it, unit length.
-    pub view_direction: Vector3<f64>,
-    /// Nearest and furthest distance at which the pyramid shows it as it was seen, metres.
-    pub range: (f64, f64),
-    /// At most one per keyframe, in order of arrival.
-    pub observations: Vec<Observation>,
-    /// Keyframe that made it.
-    pub first_keyframe: usize,
-    /// Frames in which it should have been seen, and was.
-    pub observable: u32,
-    pub observed: u32,
-    pub state: LandmarkState,
-}
-
-#[derive(Clone, Debug)]
-pub struct Keyframe {
-    /// The first keyframe of its submap. Submaps have no landmark in common and no known relative pose.
-    pub root: usize,
-    pub frame_index: usize,
-    pub timestamp_s: f64,
-    pub camera_from_world: Se3,
-    pub features: Arc<FrameFeatures>,
-    /// The landmark that each feature shows.
-    pub landmarks: Vec<Option<usize>>,
-}
-
-/// A culled keyframe, rigidly attached to its parent.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct CulledKeyframe {
-    /// A keyframe that has not been culled.
-    pub parent: usize,
-    pub camera_from_parent: Se3,
-}
+/// Links that a keyframe keeps.
+const MOST_LINKS: usize = 5;
 
 #[derive(Clone, Debug, Default)]
 pub struct Map {
@@ -85,6 +35,12 @@ pub struct Map {
     pub database: KeyframeDatabase,
     /// By keyframe; none is held by another culled one.
     pub culled: BTreeMap<usize, CulledKeyframe>,
+    /// The culled keyframes that each living one carries.
+    carried: BTreeMap<usize, Vec<usize>>,
+    /// Counts corrections of the whole map: what was computed before one does not fit what is after it.
+    pub corrections: usize,
+    /// First keyframes of submaps that have not joined another.
+    pub roots: BTreeSet<usize>,
 }
 
 impl Map {
@@ -96,11 +52,10 @@ impl Map {
             keyframe.root += keyframes;
             keyframe.camera_from_world *= other_from_world;
             keyframe.landmarks.iter_mut().flatten().for_each(|l| *l += landmarks);
-            self.database.insert(self.keyframes.len(), &keyframe.features.features);
-            self.keyframes.push(keyframe);
+            self.push(keyframe);
         }
         for mut landmark in other.landmarks {
-            landmark.position = world_from_other * landmark.position;
+            landmark.anchor += keyframes;
             landmark.first_keyframe += keyframes;
             landmark.observations.iter_mut().for_each(|o| o.keyframe += keyframes);
             if let LandmarkState::MergedInto(into) = &mut landmark.state {
@@ -111,11 +66,53 @@ impl Map {
         (landmarks..self.landmarks.len()).for_each(|l| self.refresh_geometry(l, config));
     }
 
+    /// Takes in a keyframe, the newest, and returns its id.
+    pub fn push(&mut self, mut keyframe: Keyframe) -> usize {
+        let id = self.keyframes.len();
+        self.database.insert(id, &keyframe.features.features);
+        if keyframe.root == id {
+            self.roots.insert(id);
+        }
+        if let Some(last) = self.keyframes.last() {
+            keyframe.travelled = last.travelled;
+            if last.root == keyframe.root {
+                let step = keyframe.camera_from_world * last.camera_from_world.inverse();
+                keyframe.travelled.metres += step.translation.vector.norm();
+                keyframe.travelled.radians += step.rotation.angle();
+            }
+        }
+        self.keyframes.push(keyframe);
+        id
+    }
+
+    /// A landmark's place in the world, metres.
+    pub fn position(&self, landmark: usize) -> Point3<f64> {
+        let l = &self.landmarks[landmark];
+        let anchor = &self.keyframes[l.anchor];
+        anchor.camera_from_world.inverse_transform_point(&(l.in_anchor * anchor.unit))
+    }
+
+    /// Moves a landmark to a place in the world, metres.
+    pub fn set_position(&mut self, landmark: usize, position: &Point3<f64>) {
+        let anchor = &self.keyframes[self.landmarks[landmark].anchor];
+        self.landmarks[landmark].in_anchor = (anchor.camera_from_world * position) / anchor.unit;
+    }
+
+    /// Moves a keyframe, with what hangs on it.
+    pub fn set_pose(&mut self, keyframe: usize, camera_from_world: Se3) {
+        self.keyframes[keyframe].camera_from_world = camera_from_world;
+        for culled in self.carried.get(&keyframe).into_iter().flatten() {
+            let pose = self.keyframes[keyframe].carry(&self.culled[culled].camera_from_parent);
+            self.keyframes[*culled].camera_from_world = pose;
+        }
+    }
+
     /// A landmark first seen by `observation`.
     pub fn add_landmark(&mut self, observation: Observation, position: Point3<f64>, config: &TrackingConfig) -> usize {
         let id = self.landmarks.len();
         self.landmarks.push(Landmark {
-            position,
+            anchor: observation.keyframe,
+            in_anchor: Point3::origin(),
             descriptor: self.keyframes[observation.keyframe].features.features[observation.feature].descriptor,
             view_direction: Vector3::z(),
             range: (0.0, f64::INFINITY),
@@ -126,6 +123,7 @@ impl Map {
             state: LandmarkState::Alive,
         });
         self.keyframes[observation.keyframe].landmarks[observation.feature] = Some(id);
+        self.set_position(id, &position);
         self.refresh_geometry(id, config);
         id
     }
@@ -144,9 +142,25 @@ impl Map {
         self.keyframes[observation.keyframe].landmarks[observation.feature] = None;
         let observations = &mut self.landmarks[landmark].observations;
         observations.retain(|s| *s != observation);
-        if observations.is_empty() {
-            self.landmarks[landmark].state = LandmarkState::Removed;
+        match self.landmarks[landmark].observations.first() {
+            Some(first) => self.hang_on(landmark, first.keyframe),
+            None => self.landmarks[landmark].state = LandmarkState::Removed,
         }
+    }
+
+    /// Makes a keyframe a landmark's anchor; the landmark stays where it is.
+    fn hang_on(&mut self, landmark: usize, anchor: usize) {
+        let before = self.landmarks[landmark].anchor;
+        if before == anchor {
+            return;
+        }
+        let position = self.position(landmark);
+        let (old, new) = (&self.keyframes[before], &self.keyframes[anchor]);
+        let turned = new.camera_from_world.rotation * old.camera_from_world.rotation.inverse();
+        let l = &mut self.landmarks[landmark];
+        l.anchor = anchor;
+        l.view_direction = turned * l.view_direction;
+        self.set_position(landmark, &position);
     }
 
     pub fn remove_landmark(&mut self, landmark: usize) {
@@ -200,16 +214,18 @@ impl Map {
     pub fn refresh_geometry(&mut self, landmark: usize, config: &TrackingConfig) {
         let l = &self.landmarks[landmark];
         let (Some(first), LandmarkState::Alive) = (l.observations.first(), l.state) else { return };
+        let position = self.position(landmark);
         let mut direction = Vector3::zeros();
         for observation in &l.observations {
-            let line = l.position - self.keyframes[observation.keyframe].centre();
+            let line = position - self.keyframes[observation.keyframe].centre();
             direction += line.try_normalize(1e-9).unwrap_or_default();
         }
-        let keyframe = &self.keyframes[first.keyframe];
+        let anchor = &self.keyframes[first.keyframe];
         let scale = |octave: usize| config.pyramid_scale.powi(octave as i32);
-        let octave = usize::from(keyframe.features.features[first.feature].octave);
-        let furthest = (l.position - keyframe.centre()).norm() * scale(octave);
-        let view_direction = direction.try_normalize(1e-9).unwrap_or(l.view_direction);
+        let octave = usize::from(anchor.features.features[first.feature].octave);
+        let furthest = l.in_anchor.coords.norm() * scale(octave);
+        let in_anchor = anchor.camera_from_world.rotation * direction;
+        let view_direction = in_anchor.try_normalize(1e-9).unwrap_or(l.view_direction);
         let l = &mut self.landmarks[landmark];
         l.view_direction = view_direction;
         l.range = (furthest / scale(config.pyramid_levels - 1), furthest);
@@ -224,18 +240,20 @@ impl Map {
     fn predict(&self, landmark: usize, camera_from_world: &Se3, rig: &Rig) -> Option<Projection> {
         let Rig { pinhole, config } = rig;
         let l = &self.landmarks[landmark];
-        let p_in_camera = (camera_from_world * l.position).coords;
+        let anchor = &self.keyframes[l.anchor];
+        let p_in_camera = (camera_from_world * self.position(landmark)).coords;
         let pixel = pinhole.project(&p_in_camera).filter(|pixel| pinhole.contains(pixel, 0.0))?;
         let distance = p_in_camera.norm();
-        if distance < l.range.0 / RANGE_SLACK || distance > l.range.1 * RANGE_SLACK {
+        let (nearest, furthest) = (l.range.0 * anchor.unit, l.range.1 * anchor.unit);
+        if distance < nearest / RANGE_SLACK || distance > furthest * RANGE_SLACK {
             return None;
         }
         let line_of_sight = camera_from_world.rotation.inverse() * p_in_camera / distance;
-        let view_cosine = line_of_sight.dot(&l.view_direction);
+        let view_cosine = line_of_sight.dot(&(anchor.camera_from_world.rotation.inverse() * l.view_direction));
         if view_cosine < MIN_VIEW_COSINE {
             return None;
         }
-        let octave = ((l.range.1 / distance).ln() / config.pyramid_scale.ln()).ceil();
+        let octave = ((furthest / distance).ln() / config.pyramid_scale.ln()).ceil();
         let octave = octave.clamp(0.0, config.pyramid_levels as f64 - 1.0) as u8;
         Some(Projection {
             point: landmark,
@@ -250,11 +268,8 @@ impl Map {
 
     /// Keyframes that see the given landmarks and how many of them, most first, then newest first.
     pub fn covisibility(&self, landmarks: impl Iterator<Item = usize>) -> Vec<(usize, usize)> {
-        let mut counts = vec![0usize; self.keyframes.len()];
-        for landmark in landmarks {
-            self.landmarks[landmark].observations.iter().for_each(|s| counts[s.keyframe] += 1);
-        }
-        let mut ranked: Vec<(usize, usize)> = counts.into_iter().enumerate().filter(|(_, count)| *count > 0).collect();
+        let seen = landmarks.flat_map(|l| self.landmarks[l].observations.iter().map(|s| s.keyframe));
+        let mut ranked = tally(seen);
         ranked.sort_by_key(|(keyframe, count)| (std::cmp::Reverse(*count), std::cmp::Reverse(*keyframe)));
         ranked
     }
@@ -266,9 +281,14 @@ impl Map {
         ranked
     }
 
+    /// The keyframes of a submap that have not been culled, in ascending order.
+    pub fn living_in(&self, root: usize) -> impl Iterator<Item = usize> {
+        (0..self.keyframes.len()).filter(move |k| self.keyframes[*k].root == root && !self.culled.contains_key(k))
+    }
+
     /// Whether all keyframes are of one submap.
     pub fn is_connected(&self) -> bool {
-        self.keyframes.iter().all(|k| k.root == 0)
+        self.roots.len() <= 1
     }
 
     /// Whether two keyframes are of one submap.
@@ -286,17 +306,31 @@ impl Map {
         self.culled.get(&keyframe).map_or(keyframe, |held| held.parent)
     }
 
-    /// Puts culled keyframes where those that hold them have moved.
-    pub fn carry_culled(&mut self) {
-        for (keyframe, held) in &self.culled {
-            self.keyframes[*keyframe].camera_from_world = held.camera_from_parent * self.keyframes[held.parent].camera_from_world;
+    /// The keyframe and the culled ones that go with it.
+    pub fn with_carried(&self, keyframe: usize) -> impl Iterator<Item = usize> {
+        std::iter::once(keyframe).chain(self.carried.get(&keyframe).into_iter().flatten().copied())
+    }
+
+    /// Attaches a keyframe, which has no landmarks any more, and what it carries to another one.
+    pub fn attach(&mut self, keyframe: usize, parent: usize) {
+        let carried = self.carried.remove(&keyframe).unwrap_or_default();
+        for moved in std::iter::once(keyframe).chain(carried) {
+            let camera_from_parent = self.keyframes[parent].relative(&self.keyframes[moved].camera_from_world);
+            self.culled.insert(moved, CulledKeyframe { parent, camera_from_parent });
+            self.carried.entry(parent).or_default().push(moved);
         }
+    }
+
+    /// Notes which older keyframes share most landmarks with a keyframe.
+    pub fn refresh_links(&mut self, keyframe: usize) {
+        let older = self.covisible(keyframe).into_iter().filter(|(other, _)| *other < keyframe);
+        self.keyframes[keyframe].links = older.take(MOST_LINKS).collect();
     }
 
     /// Median depth of the landmarks that a keyframe sees, metres.
     pub fn median_depth(&self, keyframe: usize) -> Option<f64> {
         let view = &self.keyframes[keyframe];
-        let depth = |l: &usize| (view.camera_from_world * self.landmarks[*l].position).z;
+        let depth = |l: &usize| (view.camera_from_world * self.position(*l)).z;
         let mut depths: Vec<f64> = view.landmarks.iter().flatten().map(depth).collect();
         depths.sort_by(f64::total_cmp);
         depths.get(depths.len() / 2).copied()
@@ -304,35 +338,18 @@ impl Map {
 
     /// The landmarks of some keyframes, each once, in order of first mention.
     pub fn landmarks_of(&self, keyframes: &[usize]) -> Vec<usize> {
-        let mut seen = vec![false; self.landmarks.len()];
-        let all = keyframes.iter().flat_map(|k| self.keyframes[*k].landmarks.iter().flatten().copied());
-        all.filter(|l| !std::mem::replace(&mut seen[*l], true)).collect()
-    }
-}
-
-impl Landmark {
-    pub fn seen_by(&self, keyframe: usize) -> bool {
-        self.observations.iter().any(|s| s.keyframe == keyframe)
-    }
-}
-
-impl Keyframe {
-    /// The camera's centre in the world, metres.
-    pub fn centre(&self) -> Point3<f64> {
-        self.camera_from_world.inverse_transform_point(&Point3::origin())
-    }
-
-    /// How many landmarks it sees that at least `observations` keyframes see.
-    pub fn landmark_count(&self, map: &Map, observations: usize) -> usize {
-        self.landmarks.iter().flatten().filter(|l| map.landmarks[**l].observations.len() >= observations).count()
+        distinct(keyframes.iter().flat_map(|k| self.keyframes[*k].landmarks.iter().flatten().copied()))
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::sync::Arc;
+
     use nalgebra::Vector2;
 
+    use crate::tracking::features::frame_features::FrameFeatures;
     use crate::tracking::features::frame_features::tests::feature;
     use crate::tracking::solvers::residual::tests::PINHOLE;
 
@@ -344,14 +361,7 @@ mod tests {
     fn map() -> Map {
         let list = (0..10).map(|i| feature(50.0 * f64::from(i), 100.0, Descriptor([1 << i, 0, 0, 0]))).collect();
         let features = Arc::new(FrameFeatures::new(list, &PINHOLE));
-        let keyframe = Keyframe {
-            root: 0,
-            frame_index: 0,
-            timestamp_s: 0.0,
-            camera_from_world: Se3::identity(),
-            features,
-            landmarks: vec![None; 10],
-        };
+        let keyframe = Keyframe::new(0, 0.0, Se3::identity(), features);
         Map { keyframes: vec![keyframe; 3], ..Default::default() }
     }
 

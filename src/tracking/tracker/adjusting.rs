@@ -10,9 +10,8 @@ use std::time::Instant;
 use super::{Tracker, milliseconds};
 use crate::sequence::Sensor;
 use crate::tracking::adjustment::local_bundle::Adjustment;
-use crate::tracking::adjustment::thread::Worker;
-use crate::tracking::loop_closing::MovedKeyframe;
 use crate::tracking::map::keyframe_culling::cull_around;
+use crate::tracking::worker::Worker;
 use crate::tracking::{KeyframeUpdate, StageTimes, TrackingError};
 
 /// Deterministic replay: frames after its keyframe at which an adjustment is taken in, at most, and as a share of those since the keyframe before:
@@ -24,7 +23,7 @@ const TAKEN_IN_SHARE: usize = 4;
 /// The worker, and what it is at.
 #[derive(Debug)]
 pub(super) struct Adjusting {
-    worker: Worker,
+    worker: Worker<Adjustment>,
     pub real_time: bool,
     under_way: Option<UnderWay>,
     /// The frame, counted from 1, at which the newest keyframe was made, and frames since the one before.
@@ -32,12 +31,14 @@ pub(super) struct Adjusting {
     interval: usize,
     /// The newest keyframe, if its surroundings are still to be adjusted.
     waiting: Option<Waiting>,
+    /// Real time: keyframes that came before it and are still to be searched for loops.
+    overtaken: Vec<usize>,
 }
 
 #[derive(Clone, Copy, Debug)]
 struct UnderWay {
-    /// The keyframe whose surroundings it adjusts; `None` for all keyframes, after a loop.
-    around: Option<usize>,
+    /// The keyframe whose surroundings it adjusts.
+    around: usize,
     /// Deterministic replay: the frame, counted from 1, at which it is taken in.
     due: usize,
 }
@@ -50,8 +51,8 @@ struct Waiting {
 }
 
 impl Adjusting {
-    pub fn new(worker: Worker) -> Self {
-        Self { worker, real_time: false, newest_at: 0, interval: 0, under_way: None, waiting: None }
+    pub fn new(worker: Worker<Adjustment>) -> Self {
+        Self { worker, real_time: false, newest_at: 0, interval: 0, under_way: None, waiting: None, overtaken: Vec::new() }
     }
 }
 
@@ -62,15 +63,20 @@ impl Tracker {
     /// # Errors
     /// [`TrackingError::Adjusting`] if the adjustment panicked.
     pub fn finish(&mut self) -> Result<Vec<KeyframeUpdate>, TrackingError> {
-        self.take_all_adjusted(&mut StageTimes::default())?;
-        Ok(self.updates())
+        loop {
+            self.take_all_adjusted(&mut StageTimes::default())?;
+            if !self.wait_for_closing()? && self.adjusting.under_way.is_none() {
+                return Ok(self.updates());
+            }
+        }
     }
 
     /// Has the surroundings of a new keyframe adjusted, now or when the worker is free.
     pub(super) fn adjust_around(&mut self, keyframe: usize, held: bool, times: &mut StageTimes) -> Result<(), TrackingError> {
         self.adjusting.interval = self.frames_seen - self.adjusting.newest_at;
         self.adjusting.newest_at = self.frames_seen;
-        self.adjusting.waiting = Some(Waiting { keyframe, held });
+        let overtaken = self.adjusting.waiting.replace(Waiting { keyframe, held });
+        self.adjusting.overtaken.extend(overtaken.map(|waiting| waiting.keyframe));
         self.begin_next(times)
     }
 
@@ -107,11 +113,14 @@ impl Tracker {
     fn take_in(&mut self, under_way: UnderWay, solved: &Adjustment, times: &mut StageTimes) -> Result<(), TrackingError> {
         let clock = Instant::now();
         self.adjusting.under_way = None;
+        if !solved.fits(&self.map) {
+            // A correction came between: once more, unless a newer keyframe's window is next.
+            self.adjusting.waiting.get_or_insert(Waiting { keyframe: under_way.around, held: true });
+            return self.begin_next(times);
+        }
         solved.apply(&mut self.map, &self.rig.config).into_iter().for_each(|k| self.note_move(k, 1.0));
         times.bundle_ms += milliseconds(clock);
-        if let Some(keyframe) = under_way.around {
-            self.close_loops_and_cull(keyframe, times)?;
-        }
+        self.close_loops_and_cull(under_way.around, times)?;
         self.follow_keyframe();
         self.begin_next(times)
     }
@@ -127,12 +136,12 @@ impl Tracker {
         let window = held.then(|| Adjustment::of_window(&self.map, keyframe, &self.rig.config)).flatten();
         times.bundle_ms += milliseconds(clock);
         match window {
-            Some(window) => self.begin(window, Some(keyframe)),
+            Some(window) => self.begin(window, keyframe),
             None => self.close_loops_and_cull(keyframe, times),
         }
     }
 
-    fn begin(&mut self, adjustment: Adjustment, around: Option<usize>) -> Result<(), TrackingError> {
+    fn begin(&mut self, adjustment: Adjustment, around: usize) -> Result<(), TrackingError> {
         self.adjusting.worker.give(adjustment)?;
         let most = if self.sensor == Sensor::Mono { 1 } else { TAKEN_IN_AFTER };
         let later = (self.adjusting.interval / TAKEN_IN_SHARE).clamp(1, most);
@@ -140,14 +149,13 @@ impl Tracker {
         Ok(())
     }
 
-    /// Runs after a keyframe's local bundle adjustment: a loop may be found, after which all is adjusted, or some of
-    /// them may have become redundant.
+    /// Runs after a keyframe's local bundle adjustment: a loop may be found, at it or at keyframes that it has overtaken, or some keyframes may
+    /// have become redundant.
     fn close_loops_and_cull(&mut self, keyframe: usize, times: &mut StageTimes) -> Result<(), TrackingError> {
-        let clock = Instant::now();
-        let closed = self.close_loop(keyframe);
-        times.loops_ms += milliseconds(clock);
-        if closed && let Some(all) = Adjustment::of_all(&self.map, &self.rig.config) {
-            return self.begin(all, None);
+        self.refresh_links(keyframe);
+        let mut closed = false;
+        for keyframe in std::mem::take(&mut self.adjusting.overtaken).into_iter().chain([keyframe]) {
+            closed = closed || self.look_for_loop(keyframe, times)?;
         }
         let clock = Instant::now();
         if !closed && self.rig.config.keyframe_culling {
@@ -158,31 +166,18 @@ impl Tracker {
         Ok(())
     }
 
-    /// Closes a loop if a keyframe shows one, and says whether it did. Frames follow their keyframes.
-    fn close_loop(&mut self, keyframe: usize) -> bool {
-        if !self.rig.config.loop_closing {
-            return false;
-        }
-        let moved = self.loops.close(&mut self.map, keyframe, &self.rig);
-        for MovedKeyframe { keyframe, growth } in &moved {
-            let theirs = self.records.iter_mut().filter(|r| r.reference == *keyframe);
-            theirs.for_each(|r| r.camera_from_reference.translation.vector *= *growth);
-            if *keyframe == self.motion.reference
-                && let Some(velocity) = &mut self.motion.velocity
-            {
-                velocity.translation.vector *= *growth;
-            }
-            self.note_move(*keyframe, *growth);
-        }
-        self.follow_keyframe();
-        !moved.is_empty()
+    /// Bundle adjustment has changed what a keyframe and its neighbours share.
+    fn refresh_links(&mut self, keyframe: usize) {
+        self.map.refresh_links(keyframe);
+        let neighbours: Vec<usize> = self.map.keyframes[keyframe].links.iter().map(|(k, _)| *k).collect();
+        neighbours.into_iter().for_each(|k| self.map.refresh_links(k));
     }
 
     /// The last frame goes with the keyframe that holds it, and forgets landmarks that are no more.
-    fn follow_keyframe(&mut self) {
+    pub(super) fn follow_keyframe(&mut self) {
         let (Some(last), Some(record)) = (&mut self.motion.last, self.records.last()) else { return };
         let keyframe = &self.map.keyframes[record.reference];
-        last.camera_from_world = record.camera_from_reference * keyframe.camera_from_world;
+        last.camera_from_world = keyframe.carry(&record.camera_from_reference);
         if record.frame_index == keyframe.frame_index {
             last.landmarks.clone_from(&keyframe.landmarks);
         } else {
@@ -191,7 +186,7 @@ impl Tracker {
     }
 
     /// A keyframe moved, and lengths around it grew by a factor.
-    fn note_move(&mut self, keyframe: usize, growth: f64) {
+    pub(super) fn note_move(&mut self, keyframe: usize, growth: f64) {
         *self.moved.entry(keyframe).or_insert(1.0) *= growth;
     }
 
@@ -222,13 +217,14 @@ mod tests {
         let newest = tracker.map.keyframes.len() - 1;
         // Landmarks of each keyframe that it saw first, and their depths, metres.
         let depths = |tracker: &Tracker| -> Vec<Vec<(usize, f64)>> {
-            let depth = |k: usize, l: usize| (tracker.map.keyframes[k].camera_from_world * tracker.map.landmarks[l].position).z;
+            let depth = |k: usize, l: usize| (tracker.map.keyframes[k].camera_from_world * tracker.map.position(l)).z;
             let own = |k: &usize, l: &usize| tracker.map.landmarks[*l].observations.first().is_some_and(|o| o.keyframe == *k);
             let seen = |k: usize| tracker.map.keyframes[k].landmarks.iter().flatten().copied().filter(move |l| own(&k, l));
             (0..=newest).map(|k| seen(k).map(|l| (l, depth(k, l))).collect()).collect()
         };
         let before = depths(&tracker);
-        assert!(tracker.close_loop(newest));
+        assert!(tracker.look_for_loop(newest, &mut StageTimes::default()).unwrap());
+        assert!(tracker.wait_for_closing().unwrap());
         tracker.note_move(3, 2.0);
         let after = depths(&tracker);
         let updates = tracker.updates();

@@ -4,6 +4,7 @@
 //! It leaves out what the rest of the project does elsewhere: rendering.
 
 mod adjusting;
+mod closing;
 mod dense_fallback;
 mod keyframe_selection;
 mod start;
@@ -14,10 +15,11 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use adjusting::Adjusting;
+use closing::Closing;
 
 use crate::geometry::{Camera, Se3, StampedPose};
 use crate::sequence::{Frame, Sensor};
-use crate::tracking::adjustment::thread::Worker;
+use crate::tracking::adjustment::local_bundle::Adjustment;
 use crate::tracking::features::frame_features::FrameFeatures;
 use crate::tracking::front_end::{ExtractedFrame, FrontEnd};
 use crate::tracking::initialisation::mono::FirstView;
@@ -28,6 +30,7 @@ use crate::tracking::map::insertion;
 use crate::tracking::map::sparse_map::{Keyframe, Map};
 use crate::tracking::map::triangulation;
 use crate::tracking::rig::Rig;
+use crate::tracking::worker::Worker;
 use crate::tracking::{KeyframePose, NewKeyframe, StageTimes, TrackedFrame, TrackingConfig, TrackingError, TrackingState};
 
 /// For this many frames after the camera was found again, poses are held to the stricter count.
@@ -59,6 +62,7 @@ pub struct Tracker {
     arrival: Option<(f64, Option<f64>)>,
     records: Vec<Record>,
     adjusting: Adjusting,
+    closing: Closing,
     /// Keyframes that moved since the last tracked frame, and the factor by which lengths around each have grown.
     moved: BTreeMap<usize, f64>,
 }
@@ -98,6 +102,7 @@ struct Record {
     frame_index: usize,
     timestamp_s: f64,
     reference: usize,
+    /// In the reference keyframe's unit of length.
     camera_from_reference: Se3,
 }
 
@@ -116,7 +121,9 @@ impl Tracker {
             keyframe_rotation_rad: spacing * config.keyframe_rotation_rad,
             ..config.clone()
         };
-        let worker = Worker::start(pinhole, config.bundle_iterations)?;
+        let steps = config.bundle_iterations;
+        let solve = move |adjustment: &mut Adjustment| adjustment.solve(&pinhole, steps);
+        let worker = Worker::start("adjusting", solve)?;
         Ok(Self {
             rig: Rig { pinhole, config },
             sensor,
@@ -131,6 +138,7 @@ impl Tracker {
             arrival: None,
             records: Vec::new(),
             adjusting: Adjusting::new(worker),
+            closing: Closing::start(pinhole, steps)?,
             moved: BTreeMap::new(),
         })
     }
@@ -165,6 +173,7 @@ impl Tracker {
         self.lostness.frames_lost += self.missing_before(frame);
         let mut times = StageTimes { features_ms: frame.features_ms, ..StageTimes::default() };
         self.take_adjusted(&mut times)?;
+        self.take_closed(&mut times)?;
         let mut tracked = match self.motion.last.take() {
             Some(last) => self.go_on(frame, last, may_be_keyframe, times)?,
             None if self.sensor == Sensor::Mono => self.start_without_depth(frame, may_be_keyframe, times),
@@ -203,7 +212,7 @@ impl Tracker {
     /// corrections of keyframes move it. Lost frames are absent, and those of submaps that never joined the largest one.
     pub fn trajectory(&self) -> Vec<(usize, StampedPose)> {
         let largest = self.largest_submap();
-        let pose = |r: &Record| (r.camera_from_reference * self.map.keyframes[r.reference].camera_from_world).inverse();
+        let pose = |r: &Record| self.map.keyframes[r.reference].carry(&r.camera_from_reference).inverse();
         self.records
             .iter()
             .filter(|r| self.map.keyframes[r.reference].root == largest)
@@ -290,7 +299,7 @@ impl Tracker {
         let due =
             may_be_keyframe && keyframe_selection::is_due(&self.map, &features, &found, self.motion.reference, &self.rig.config);
         let Localised { camera_from_world, landmarks, inliers, dense, .. } = found;
-        let camera_from_reference = camera_from_world * self.map.keyframes[self.motion.reference].camera_from_world.inverse();
+        let camera_from_reference = self.map.keyframes[self.motion.reference].relative(&camera_from_world);
         self.record(frame, self.motion.reference, camera_from_reference);
         self.motion.last = Some(LastFrame { features, camera_from_world, landmarks });
         let new_keyframe = if due { self.make_keyframe(frame, !dense, &mut times)? } else { None };
@@ -314,14 +323,9 @@ impl Tracker {
         self.finish_adjustment_before_keyframe(times)?;
         let Some(LastFrame { features, camera_from_world, landmarks }) = self.motion.last.take() else { return Ok(None) };
         let clock = Instant::now();
-        let keyframe = Keyframe {
-            root: self.map.keyframes[self.motion.reference].root,
-            frame_index: frame.index,
-            timestamp_s: frame.timestamp_s,
-            camera_from_world,
-            features: features.clone(),
-            landmarks,
-        };
+        let root = self.map.keyframes[self.motion.reference].root;
+        let keyframe = Keyframe::new(frame.index, frame.timestamp_s, camera_from_world, features.clone());
+        let keyframe = Keyframe { root, landmarks, ..keyframe };
         let id = insertion::insert_keyframe(&mut self.map, keyframe, &self.rig);
         triangulation::triangulate_with_neighbours(&mut self.map, id, &self.rig);
         insertion::fuse_with_neighbours(&mut self.map, id, &self.rig);
@@ -340,7 +344,7 @@ impl Tracker {
     /// The keyframe's message to the mapper.
     fn describe(&self, id: usize) -> NewKeyframe {
         let keyframe = &self.map.keyframes[id];
-        let depth = |l: usize| (keyframe.camera_from_world * self.map.landmarks[l].position).z;
+        let depth = |l: usize| (keyframe.camera_from_world * self.map.position(l)).z;
         let pairs = keyframe.features.features.iter().zip(&keyframe.landmarks);
         let seen = match self.sensor {
             Sensor::Rgbd => Vec::new(),

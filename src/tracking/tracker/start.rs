@@ -18,14 +18,8 @@ impl Tracker {
             return TrackedFrame::lost(times);
         }
         let camera_from_world = self.next_submap().inverse();
-        let keyframe = Keyframe {
-            root: self.map.keyframes.len(),
-            frame_index: frame.index,
-            timestamp_s: frame.timestamp_s,
-            camera_from_world,
-            features: features.clone(),
-            landmarks: Vec::new(),
-        };
+        let keyframe = Keyframe::new(frame.index, frame.timestamp_s, camera_from_world, features.clone());
+        let keyframe = Keyframe { root: self.map.keyframes.len(), ..keyframe };
         let id = insertion::insert_keyframe(&mut self.map, keyframe, &self.rig);
         let landmarks = self.map.keyframes[id].landmarks.clone();
         self.record(frame, id, Se3::identity());

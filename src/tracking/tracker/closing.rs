@@ -1,0 +1,172 @@
+//! Loops beside tracking: a correction is solved in a thread of its own, taken into the map when it is ready, and followed by bundle adjustment of
+//! all that it moved: at once where that is little, else window by window.
+//!
+//! As with bundle adjustment, deterministic replay takes a result in at a fixed frame, the later the larger it is, and real time when it is ready.
+
+use std::collections::VecDeque;
+
+use super::{Tracker, milliseconds};
+use crate::geometry::Pinhole;
+use crate::tracking::adjustment::local_bundle::Adjustment;
+use crate::tracking::loop_closing::{Correction, MovedKeyframe};
+use crate::tracking::worker::Worker;
+use crate::tracking::{StageTimes, TrackingError};
+use std::time::Instant;
+
+/// Deterministic replay: keyframes of a correction, and observations of an adjustment, that the thread has to itself a frame for.
+const KEYFRAMES_A_FRAME: usize = 8;
+const OBSERVATIONS_A_FRAME: usize = 2000;
+/// Of the keyframes that a correction has moved, every so many gets a window of its own.
+const WINDOW_EVERY: usize = 4;
+
+/// The worker, and what it is at.
+#[derive(Debug)]
+pub(super) struct Closing {
+    worker: Worker<Job>,
+    /// Deterministic replay: the frame, counted from 1, at which the job under way is taken in.
+    due: Option<usize>,
+    /// A correction is under way, or waits for the worker.
+    correcting: bool,
+    waiting: Option<Correction>,
+    /// Keyframes whose windows are still to be adjusted.
+    unsettled: VecDeque<usize>,
+}
+
+#[derive(Debug)]
+enum Job {
+    Correct(Correction),
+    /// Of all keyframes, or of a window.
+    Adjust(Adjustment, Extent),
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Extent {
+    All,
+    Window,
+}
+
+impl Closing {
+    pub fn start(pinhole: Pinhole, steps: usize) -> Result<Self, TrackingError> {
+        let solve = move |job: &mut Job| match job {
+            Job::Correct(correction) => correction.solve(),
+            Job::Adjust(adjustment, _) => adjustment.solve(&pinhole, steps),
+        };
+        let worker = Worker::start("closing", solve)?;
+        Ok(Self { worker, due: None, correcting: false, waiting: None, unsettled: VecDeque::new() })
+    }
+}
+
+impl Tracker {
+    /// Looks for a loop at a keyframe; `false` if there was none. One of two submaps joins them at once, any other is corrected beside tracking.
+    pub(super) fn look_for_loop(&mut self, keyframe: usize, times: &mut StageTimes) -> Result<bool, TrackingError> {
+        if !self.rig.config.loop_closing || self.closing.correcting {
+            return Ok(false);
+        }
+        let clock = Instant::now();
+        let recognised = self.loops.recognise(&mut self.map, keyframe, &self.rig);
+        let found = recognised.is_some();
+        match recognised {
+            Some(correction) if correction.is_solved() => self.take_correction(&correction)?,
+            Some(correction) => {
+                self.closing.correcting = true;
+                self.closing.waiting = Some(correction);
+                self.begin_next_closing()?;
+            }
+            None => {}
+        }
+        times.loops_ms += milliseconds(clock);
+        Ok(found)
+    }
+
+    /// Takes in what the thread has solved, if it is time for it.
+    pub(super) fn take_closed(&mut self, times: &mut StageTimes) -> Result<(), TrackingError> {
+        let Some(due) = self.closing.due else { return Ok(()) };
+        let clock = Instant::now();
+        let solved = match self.adjusting.real_time {
+            true => self.closing.worker.poll()?,
+            false if self.frames_seen >= due => Some(self.closing.worker.wait()?),
+            false => None,
+        };
+        solved.map_or(Ok(()), |job| self.take_job(job))?;
+        times.loops_ms += milliseconds(clock);
+        Ok(())
+    }
+
+    /// Waits for the job under way; `false` if there is none.
+    pub(super) fn wait_for_closing(&mut self) -> Result<bool, TrackingError> {
+        if self.closing.due.is_none() {
+            return Ok(false);
+        }
+        let job = self.closing.worker.wait()?;
+        self.take_job(job)?;
+        Ok(true)
+    }
+
+    fn take_job(&mut self, job: Job) -> Result<(), TrackingError> {
+        self.closing.due = None;
+        match job {
+            Job::Correct(correction) => {
+                self.closing.correcting = false;
+                self.take_correction(&correction)?;
+            }
+            Job::Adjust(adjustment, extent) if adjustment.fits(&self.map) => {
+                adjustment.apply(&mut self.map, &self.rig.config).into_iter().for_each(|k| self.note_move(k, 1.0));
+                // Windows that were being adjusted meanwhile do not fit any more.
+                self.map.corrections += usize::from(extent == Extent::All);
+                self.follow_keyframe();
+            }
+            Job::Adjust(..) => {}
+        }
+        self.begin_next_closing()
+    }
+
+    fn take_correction(&mut self, correction: &Correction) -> Result<(), TrackingError> {
+        let moved = self.loops.apply(correction, &mut self.map, &self.rig);
+        for MovedKeyframe { keyframe, growth } in &moved {
+            if *keyframe == self.motion.reference
+                && let Some(velocity) = &mut self.motion.velocity
+            {
+                velocity.translation.vector *= *growth;
+            }
+            self.note_move(*keyframe, *growth);
+        }
+        self.follow_keyframe();
+        let living = moved.iter().map(|m| m.keyframe).filter(|k| !self.map.culled.contains_key(k));
+        self.closing.unsettled = living.step_by(WINDOW_EVERY).collect();
+        self.begin_next_closing()
+    }
+
+    /// Gives the thread its next job: a correction, or bundle adjustment of what the last one moved.
+    fn begin_next_closing(&mut self) -> Result<(), TrackingError> {
+        if self.closing.due.is_some() {
+            return Ok(());
+        }
+        if let Some(correction) = self.closing.waiting.take() {
+            self.closing.unsettled.clear();
+            let later = 1 + correction.size() / KEYFRAMES_A_FRAME;
+            return self.give_closing(Job::Correct(correction), later);
+        }
+        let Some(first) = self.closing.unsettled.front().copied() else { return Ok(()) };
+        let (root, config) = (self.map.keyframes[first].root, &self.rig.config);
+        if let Some(all) = Adjustment::of_all(&self.map, root, config) {
+            self.closing.unsettled.clear();
+            let later = 1 + all.problem.observations.len() / OBSERVATIONS_A_FRAME;
+            return self.give_closing(Job::Adjust(all, Extent::All), later);
+        }
+        while let Some(keyframe) = self.closing.unsettled.pop_front() {
+            let lives = !self.map.culled.contains_key(&keyframe);
+            let window = lives.then(|| Adjustment::of_window(&self.map, keyframe, &self.rig.config)).flatten();
+            if let Some(window) = window {
+                let later = 1 + window.problem.observations.len() / OBSERVATIONS_A_FRAME;
+                return self.give_closing(Job::Adjust(window, Extent::Window), later);
+            }
+        }
+        Ok(())
+    }
+
+    fn give_closing(&mut self, job: Job, later: usize) -> Result<(), TrackingError> {
+        self.closing.worker.give(job)?;
+        self.closing.due = Some(self.frames_seen + later);
+        Ok(())
+    }
+}
