@@ -72,22 +72,32 @@ pub struct Search<'a> {
 }
 
 impl Search<'_> {
-    /// Old keyframes that resemble `keyframe` and are not connected with it, best first, one of each place.
-    pub fn candidates(&self, keyframe: usize) -> Vec<usize> {
+    /// Old keyframes that resemble `keyframe` and are not connected with it, best first or nearest first, one of each place.
+    pub fn candidates(&self, keyframe: usize, nearest_first: bool) -> Vec<usize> {
         let connected = self.connected(keyframe);
         let is_connected = |k: usize| k == keyframe || connected.contains(&k);
         let ranked = self.map.database.query(&self.map.keyframes[keyframe].features.features);
         let neighbour = ranked.iter().find(|r| r.keyframe != keyframe && is_connected(r.keyframe));
         let least = MIN_SCORE_SHARE * neighbour.map_or(0.0, |r| r.score);
-        let mut chosen: Vec<usize> = Vec::new();
-        for found in ranked.iter().filter(|r| r.score >= least && !is_connected(r.keyframe)) {
-            let old = self.is_old(found.keyframe, keyframe);
-            let same_place = || chosen.iter().any(|c| self.connected(*c).contains(&found.keyframe));
-            if old && !same_place() {
-                chosen.push(found.keyframe);
-            }
+        let mut old: Vec<usize> = ranked
+            .iter()
+            .filter(|r| r.score >= least && !is_connected(r.keyframe) && self.is_old(r.keyframe, keyframe))
+            .map(|r| r.keyframe)
+            .collect();
+        if nearest_first {
+            let here = self.map.keyframes[keyframe].centre();
+            old.sort_by(|a, b| {
+                (self.map.keyframes[*a].centre() - here).norm().total_cmp(&(self.map.keyframes[*b].centre() - here).norm())
+            });
+        }
+        let (mut chosen, mut places): (Vec<usize>, Vec<usize>) = (Vec::new(), Vec::new());
+        for place in old {
             if chosen.len() == MAX_CANDIDATES {
                 break;
+            }
+            if !places.contains(&place) {
+                places.extend(self.connected(place));
+                chosen.push(place);
             }
         }
         chosen
@@ -104,7 +114,7 @@ impl Search<'_> {
         shared.take_while(|(_, shared)| *shared >= CONNECTED_SHARED).map(|(k, _)| k).collect()
     }
 
-    /// Makes sure that `keyframe` shows `place`.
+    /// Makes sure that `keyframe` shows `place`, or a place that looks just like it.
     pub fn recognise(&self, keyframe: usize, place: usize) -> Option<Recognised> {
         let aligned = self.align(keyframe, place)?;
         let mut around = vec![place];
@@ -138,10 +148,7 @@ impl Search<'_> {
             translation: seen.camera_from_world.translation.vector * rough.scale,
             scale: rough.scale,
         };
-        if !confirmed || !self.plausible(keyframe, place, &corrected) {
-            return None;
-        }
-        Some(Recognised { keyframe, place, corrected, matches: seen.matches, landmarks })
+        confirmed.then_some(Recognised { keyframe, place, corrected, matches: seen.matches, landmarks })
     }
 
     /// The point that a feature shows: its landmark, or where its depth was measured.
@@ -184,20 +191,26 @@ impl Search<'_> {
         Seen { camera_from_world: estimate.camera_from_world, matches, expected: visible.len() }
     }
 
-    /// Whether drift on the way from `place` to `keyframe` can explain the correction. Nothing is known of the way between submaps.
-    fn plausible(&self, keyframe: usize, place: usize, corrected: &Sim3) -> bool {
-        if !self.map.connects(keyframe, place) {
+    /// Whether drift on the way from the place to the keyframe can explain the correction. Nothing is known of the way between submaps.
+    pub fn is_plausible(&self, found: &Recognised) -> bool {
+        let Recognised { keyframe, place, corrected, .. } = found;
+        if !self.map.connects(*keyframe, *place) {
             return true;
         }
-        let current = self.map.keyframes[keyframe].camera_from_world;
-        let off = corrected.to_rigid().inverse() * current;
-        let (here, there) = (&self.map.keyframes[keyframe].travelled, &self.map.keyframes[place].travelled);
-        let (path_metres, rotation_rad) = ((here.metres - there.metres).abs(), (here.radians - there.radians).abs());
-        let shift = (current.inverse().translation.vector - corrected.to_rigid().inverse().translation.vector).norm();
+        let (here, there) = (&self.map.keyframes[*keyframe], &self.map.keyframes[*place]);
+        let path_metres = (here.travelled.metres - there.travelled.metres).abs();
+        let rotation_rad = (here.travelled.radians - there.travelled.radians).abs();
+        let off = corrected.to_rigid().inverse() * here.camera_from_world;
         let grown = corrected.scale.max(1.0 / corrected.scale);
-        shift <= DRIFT_METRES + MAX_DRIFT_SHARE * path_metres
+        self.shift_metres(found) <= DRIFT_METRES + MAX_DRIFT_SHARE * path_metres
             && off.rotation.angle() <= DRIFT_RAD + MAX_DRIFT_SHARE * rotation_rad
             && grown <= MAX_SCALE_DRIFT
+    }
+
+    /// How far the correction moves the keyframe, metres.
+    pub fn shift_metres(&self, found: &Recognised) -> f64 {
+        let corrected = Point3::from(found.corrected.to_rigid().inverse().translation.vector);
+        (self.map.keyframes[found.keyframe].centre() - corrected).norm()
     }
 }
 

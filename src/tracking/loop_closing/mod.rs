@@ -15,6 +15,8 @@ use detection::{Search, knows_scale};
 
 /// Least keyframes between two closed loops.
 const REST: usize = 5;
+/// Where places repeat, a loop may correct less than this share of their distance: more may lead to the next that looks alike.
+const REPEAT_SHARE: f64 = 0.3;
 
 /// A loop that was closed, or the place at which two submaps joined.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -28,12 +30,20 @@ pub struct ClosedLoop {
 }
 
 /// Closes loops, and remembers them: later corrections keep to earlier ones.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug)]
 pub struct LoopCloser {
     /// The keyframe of the last loop.
     last: Option<usize>,
+    /// How near to each other places were seen that look alike and cannot be the same.
+    repeat_metres: f64,
     /// Factors of all loops.
     edges: Vec<Edge>,
+}
+
+impl Default for LoopCloser {
+    fn default() -> Self {
+        Self { last: None, repeat_metres: f64::INFINITY, edges: Vec::new() }
+    }
 }
 
 impl LoopCloser {
@@ -45,8 +55,21 @@ impl LoopCloser {
             return None;
         }
         let search = Search { map, rig, scale_is_free: !knows_scale(map) };
-        let places = search.candidates(keyframe).into_iter().filter(|place| !rests || !map.connects(keyframe, *place));
-        let recognised = places.into_iter().find_map(|place| search.recognise(keyframe, place))?;
+        let places = search.candidates(keyframe, self.repeat_metres.is_finite()).into_iter();
+        let mut recognised = None;
+        for found in places.filter_map(|place| search.recognise(keyframe, place)) {
+            let in_one_submap = map.connects(keyframe, found.place);
+            let shift_metres = search.shift_metres(&found);
+            if !search.is_plausible(&found) {
+                self.repeat_metres = self.repeat_metres.min(shift_metres);
+            } else if in_one_submap && (rests || shift_metres > REPEAT_SHARE * self.repeat_metres) {
+                tracing::debug!(keyframe, place = found.place, shift_metres, "a place that may be another one like it");
+            } else {
+                recognised = Some(found);
+                break;
+            }
+        }
+        let recognised = recognised?;
         let scale_is_free = search.scale_is_free;
         self.last = Some(keyframe);
         self.edges.push(loop_edge(map, &recognised));

@@ -99,7 +99,9 @@ impl Map {
     }
 
     /// Moves a keyframe, with what hangs on it.
-    pub fn set_pose(&mut self, keyframe: usize, camera_from_world: Se3) {
+    pub fn set_pose(&mut self, keyframe: usize, mut camera_from_world: Se3) {
+        // The inverse of a rotation that is not quite one would double the error with each correction.
+        camera_from_world.rotation.renormalize();
         self.keyframes[keyframe].camera_from_world = camera_from_world;
         for culled in self.carried.get(&keyframe).into_iter().flatten() {
             let pose = self.keyframes[keyframe].carry(&self.culled[culled].camera_from_parent);

@@ -17,7 +17,7 @@ const MIN_COSINE: f64 = 0.17;
 /// Distance between the samples of a line of sight, as a share of half the hall's width.
 const SAMPLE: f64 = 0.3;
 /// Distance at which a point is as large as the finest pyramid level, as a share of the sight.
-const FINEST_AT: std::ops::Range<f64> = 0.35..2.0;
+const FINEST_AT: std::ops::Range<f64> = 0.12..1.5;
 
 /// A hall between a crossing and the next along x or z.
 type Edge = (Crossing, bool);
