@@ -64,7 +64,8 @@ pub struct RunArgs {
     /// Most GPU memory that the mapper may use, e.g. 500M or 2G.
     #[arg(long, value_parser = parse_bytes)]
     max_gpu_memory: Option<u64>,
-    /// Most host memory for images of keyframes that left the GPU, e.g. 500M or 2G; a temporary file holds the rest.
+    /// Most host memory, e.g. 500M or 2G: three quarters for images of keyframes that left the GPU, of which a temporary file holds the rest, and a
+    /// quarter for the tracker's map.
     #[arg(long, value_parser = parse_bytes)]
     max_host_memory: Option<u64>,
     /// Keep a checkpoint after every so many keyframes (and rounds of a refinement), for `keysplat resume`.
@@ -153,7 +154,10 @@ impl RunArgs {
         config.mapping.refine.seconds = self.time.or(config.mapping.refine.seconds);
         config.mapping.limits.max_gaussians = self.max_gaussians.or(config.mapping.limits.max_gaussians);
         config.mapping.limits.max_gpu_bytes = self.max_gpu_memory.or(config.mapping.limits.max_gpu_bytes);
-        config.mapping.limits.max_host_bytes = self.max_host_memory.unwrap_or(config.mapping.limits.max_host_bytes);
+        if let Some(bytes) = self.max_host_memory {
+            config.tracking.max_host_bytes = bytes / 4;
+            config.mapping.limits.max_host_bytes = bytes - bytes / 4;
+        }
         config.with_settings(&self.set).into_diagnostic()
     }
 }

@@ -36,7 +36,7 @@ pub struct LimitsConfig {
 
 impl Default for LimitsConfig {
     fn default() -> Self {
-        Self { max_gaussians: None, max_gpu_bytes: None, max_gpu_images: 400, max_host_bytes: 4 << 30 }
+        Self { max_gaussians: None, max_gpu_bytes: None, max_gpu_images: 400, max_host_bytes: 3 << 30 }
     }
 }
 

@@ -52,6 +52,8 @@ pub struct TrackingConfig {
     pub bundle_iterations: usize,
     /// Whether keyframes that show nothing of their own are given up.
     pub keyframe_culling: bool,
+    /// Host memory for keyframes and landmarks, bytes; beyond it keyframes are given up where many see the same.
+    pub max_host_bytes: u64,
     /// Whether drift is taken out where a known place is seen again.
     pub loop_closing: bool,
 }
@@ -79,6 +81,7 @@ impl Default for TrackingConfig {
             window_keyframes: 24,
             bundle_iterations: 5,
             keyframe_culling: true,
+            max_host_bytes: 1 << 30,
             loop_closing: true,
         }
     }

@@ -6,3 +6,4 @@ mod common;
 mod evo;
 mod recordings;
 mod regression;
+mod walks;

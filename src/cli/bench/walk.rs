@@ -8,7 +8,7 @@ use keysplat::Config;
 use keysplat::evaluation::{Alignment, evaluate_trajectory};
 use keysplat::files::write_atomically;
 use keysplat::geometry::{Se3, StampedPose, Trajectory};
-use keysplat::tracking::{ClosedLoop, Tracker};
+use keysplat::tracking::{ClosedLoop, StageTimes, Tracker};
 use keysplat::verification::walk::{Walk, World};
 use miette::IntoDiagnostic;
 
@@ -43,6 +43,8 @@ struct Part {
     lost: usize,
     total_ms: f64,
     longest_ms: f64,
+    /// What it spent most of that on.
+    longest_stage: &'static str,
     keyframes: usize,
     living: usize,
     /// Of this process, bytes; 0 where the system does not say.
@@ -63,7 +65,7 @@ pub(super) fn walk(args: &WalkArgs, verbosity: Verbosity) -> miette::Result<()> 
         "| seed | frames | lost | keyframes | living | loops | wrong | ATE RMSE, cm | ms a frame | longest | memory, MB |\n\
          |---|---|---|---|---|---|---|---|---|---|---|\n",
     );
-    let mut csv = String::from("seed,frame,lost,keyframes,living,ms_per_frame,longest_ms,memory_bytes\n");
+    let mut csv = String::from("seed,frame,lost,keyframes,living,ms_per_frame,longest_ms,longest_stage,memory_bytes\n");
     for seed in 0..args.seeds {
         let outcome = replay(args, seed, &bar)?;
         let Outcome { parts, loops, wrong_loops, ate_rmse_m } = &outcome;
@@ -71,12 +73,13 @@ pub(super) fn walk(args: &WalkArgs, verbosity: Verbosity) -> miette::Result<()> 
         for part in parts {
             frame += part.frames;
             let ms = part.total_ms / part.frames.max(1) as f64;
-            let Part { lost, keyframes, living, longest_ms, memory, .. } = part;
-            csv += &format!("{seed},{frame},{lost},{keyframes},{living},{ms:.3},{longest_ms:.2},{memory}\n");
+            let Part { lost, keyframes, living, longest_ms, longest_stage, memory, .. } = part;
+            csv += &format!("{seed},{frame},{lost},{keyframes},{living},{ms:.3},{longest_ms:.2},{longest_stage},{memory}\n");
             if args.seeds == 1 {
                 let megabytes = memory >> 20;
-                table +=
-                    &format!("| | {frame} | {lost} | {keyframes} | {living} | | | | {ms:.2} | {longest_ms:.1} | {megabytes} |\n");
+                table += &format!(
+                    "| | {frame} | {lost} | {keyframes} | {living} | | | | {ms:.2} | {longest_ms:.1} ({longest_stage}) | {megabytes} |\n"
+                );
             }
         }
         let last = parts.last().map_or((0, 0, 0), |p| (p.keyframes, p.living, p.memory >> 20));
@@ -113,7 +116,9 @@ fn replay(args: &WalkArgs, seed: u64, bar: &indicatif::ProgressBar) -> miette::R
         part.frames += 1;
         part.lost += usize::from(tracked.world_from_camera.is_none());
         part.total_ms += ms;
-        part.longest_ms = part.longest_ms.max(ms);
+        if ms > part.longest_ms {
+            (part.longest_ms, part.longest_stage) = (ms, longest_stage(&tracked.times));
+        }
         (part.keyframes, part.living) = (tracker.keyframe_count(), tracker.living_keyframes());
         if i % 100 == 0 {
             part.memory = memory();
@@ -133,6 +138,16 @@ fn replay(args: &WalkArgs, seed: u64, bar: &indicatif::ProgressBar) -> miette::R
     let poses = tracker.trajectory().into_iter().map(|(_, pose)| pose).collect();
     let errors = evaluate_trajectory(&truth, &Trajectory { poses }, Alignment::Rigid);
     Ok(Outcome { parts, loops: loops.len(), wrong_loops, ate_rmse_m: errors.ok().map(|e| e.ate_rmse_m) })
+}
+
+fn longest_stage(times: &StageTimes) -> &'static str {
+    let stages = [
+        (times.localise_ms, "localisation"),
+        (times.mapping_ms, "map"),
+        (times.bundle_ms, "bundle adjustment"),
+        (times.loops_ms, "loops"),
+    ];
+    stages.into_iter().max_by(|a, b| a.0.total_cmp(&b.0)).map_or("", |(_, name)| name)
 }
 
 /// Resident memory of this process, bytes; 0 where the system does not say.

@@ -9,7 +9,7 @@ use std::collections::BTreeMap;
 
 use crate::geometry::{Pinhole, Se3};
 use crate::tracking::TrackingConfig;
-use crate::tracking::map::sparse_map::{LandmarkState, Map, Observation};
+use crate::tracking::map::sparse_map::{Map, Observation};
 use crate::tracking::rig::Rig;
 use crate::tracking::solvers::bundle::{BundleObservation, BundleProblem};
 use crate::tracking::solvers::residual::InlierClass;
@@ -95,14 +95,15 @@ impl Adjustment {
             map.set_pose(newer, newer_from_neighbour * map.keyframes[neighbour].camera_from_world);
         }
         for (l, point) in self.landmarks.iter().zip(&self.problem.points) {
-            if map.landmarks[*l].state == LandmarkState::Alive {
+            if map.is_alive_since(*l, self.known) {
                 map.set_position(*l, point);
             }
         }
         for (o, observation) in self.problem.observations.iter().zip(&self.observations) {
             let landmark = self.landmarks[o.point];
             let seen = map.keyframes[observation.keyframe].landmarks.get(observation.feature);
-            if o.class == InlierClass::Outlier && seen == Some(&Some(landmark)) {
+            let is_seen = seen == Some(&Some(landmark)) && map.is_alive_since(landmark, self.known);
+            if o.class == InlierClass::Outlier && is_seen {
                 map.remove_observation(landmark, *observation);
             }
         }
@@ -173,7 +174,7 @@ mod tests {
     use super::*;
     use crate::geometry::{Sim3, se3};
     use crate::tracking::loop_closing::tests::drifted;
-    use crate::tracking::map::sparse_map::Keyframe;
+    use crate::tracking::map::sparse_map::{Keyframe, LandmarkState};
     use nalgebra::{Point3, Vector6};
 
     #[test]

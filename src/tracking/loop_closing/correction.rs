@@ -144,7 +144,7 @@ impl Correction {
         let lives = |k: &usize| !map.culled.contains_key(k) && map.connects(*k, keyframe);
         let since: Vec<usize> = since.filter(|k| lives(k) && !around.contains(k)).collect();
         around.extend(since);
-        take_over(map, &self.found, &rig.config);
+        take_over(map, &self.found, self.known, &rig.config);
         for keyframe in std::iter::once(keyframe).chain(around) {
             fuse(map, keyframe, &self.found.landmarks, rig);
         }
@@ -182,8 +182,12 @@ fn edge(a: usize, b: usize, a_from_b: Sim3, shared: usize, depth: f64) -> Edge {
 }
 
 /// The place's landmarks take over what the keyframe's features showed.
-fn take_over(map: &mut Map, found: &Recognised, config: &TrackingConfig) {
+fn take_over(map: &mut Map, found: &Recognised, known: usize, config: &TrackingConfig) {
     for (landmark, feature) in &found.matches {
+        // Another one may have its place by now.
+        if map.landmarks[*landmark].first_keyframe >= known {
+            continue;
+        }
         let Some(landmark) = map.resolve(*landmark) else { continue };
         match map.keyframes[found.keyframe].landmarks[*feature] {
             Some(own) => map.merge(own, landmark),

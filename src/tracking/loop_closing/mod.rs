@@ -5,6 +5,8 @@ mod detection;
 #[cfg(test)]
 pub mod tests;
 
+use std::collections::BTreeSet;
+
 use crate::geometry::Se3;
 use crate::tracking::map::Map;
 use crate::tracking::rig::Rig;
@@ -36,13 +38,14 @@ pub struct LoopCloser {
     last: Option<usize>,
     /// How near to each other places were seen that look alike and cannot be the same.
     repeat_metres: f64,
-    /// Factors of all loops.
+    /// Factors of all loops, and the keyframes at their ends.
     edges: Vec<Edge>,
+    ends: BTreeSet<usize>,
 }
 
 impl Default for LoopCloser {
     fn default() -> Self {
-        Self { last: None, repeat_metres: f64::INFINITY, edges: Vec::new() }
+        Self { last: None, repeat_metres: f64::INFINITY, edges: Vec::new(), ends: BTreeSet::new() }
     }
 }
 
@@ -73,6 +76,7 @@ impl LoopCloser {
         let scale_is_free = search.scale_is_free;
         self.last = Some(keyframe);
         self.edges.push(loop_edge(map, &recognised));
+        self.ends.extend([keyframe, recognised.place]);
         let in_one_submap = map.connects(keyframe, recognised.place);
         let kind = if in_one_submap { "loop closed" } else { "submaps joined" };
         tracing::info!(keyframe, place = recognised.place, landmarks = recognised.matches.len(), "{kind}");
@@ -95,6 +99,6 @@ impl LoopCloser {
 
     /// Whether a loop begins or ends at a keyframe.
     pub fn holds(&self, keyframe: usize) -> bool {
-        self.edges.iter().any(|e| e.a == keyframe || e.b == keyframe)
+        self.ends.contains(&keyframe)
     }
 }

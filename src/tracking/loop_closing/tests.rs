@@ -158,3 +158,20 @@ fn submaps_that_show_one_place_become_one() {
         assert!(map.covisible(newest).iter().any(|(k, shared)| *k < first && *shared > 50));
     }
 }
+
+#[test]
+fn rotations_stay_rotations_through_any_number_of_corrections() {
+    let config = TrackingConfig::default();
+    let step = sim3::exp(&Vector7::from_column_slice(&[0.004, 0.001, -0.003, 0.001, 0.003, 0.0005, 0.0]));
+    let mut map = drifted(&step, true, &config);
+    let (newest, rig) = (map.keyframes.len() - 1, Rig { pinhole: PINHOLE, config });
+    let mut closer = LoopCloser::default();
+    let mut correction = closer.recognise(&mut map, newest, &rig).unwrap();
+    correction.solve();
+    for _ in 0..200 {
+        closer.apply(&correction, &mut map, &rig);
+    }
+    assert!(
+        map.keyframes.iter().all(|k| (k.camera_from_world.rotation.norm() - 1.0).abs() < 1e-12 && k.centre().coords.norm() < 1e3)
+    );
+}

@@ -89,16 +89,21 @@ pub fn fuse(map: &mut Map, keyframe: usize, landmarks: &[usize], rig: &Rig) {
 
 /// Removes landmarks that ended their probation badly, and those rarely found where they should be.
 pub fn cull_recent_landmarks(map: &mut Map, newest_keyframe: usize) {
-    // Landmarks are in the order in which keyframes made them.
-    let on_probation = map.landmarks.partition_point(|l| l.first_keyframe + RECENT_KEYFRAMES < newest_keyframe);
-    for l in on_probation..map.landmarks.len() {
+    while map.probation.front().is_some_and(|(_, made_by)| made_by + RECENT_KEYFRAMES < newest_keyframe) {
+        map.probation.pop_front();
+    }
+    for i in 0..map.probation.len() {
+        let (l, made_by) = map.probation[i];
         let landmark = &map.landmarks[l];
+        if landmark.state != LandmarkState::Alive || landmark.first_keyframe != made_by {
+            continue;
+        }
         let age = newest_keyframe - landmark.first_keyframe;
         let rarely_found = f64::from(landmark.observed) < MIN_OBSERVED_SHARE * f64::from(landmark.observable);
         let measured =
             landmark.observations.iter().any(|s| map.keyframes[s.keyframe].features.features[s.feature].depth_metres.is_some());
         let alone = age == RECENT_KEYFRAMES && landmark.observations.len() < if measured { 2 } else { 3 };
-        if landmark.state == LandmarkState::Alive && (alone || rarely_found) {
+        if alone || rarely_found {
             map.remove_landmark(l);
         }
     }

@@ -4,10 +4,7 @@
 //! A culled keyframe keeps its id and its place in the list: its pose goes rigidly with the living keyframe that it shared most with.
 //! But it sees nothing any more, and hence takes part in nothing.
 
-use std::sync::Arc;
-
 use crate::tracking::TrackingConfig;
-use crate::tracking::features::frame_features::FrameFeatures;
 use crate::tracking::map::sparse_map::{Map, Observation};
 
 /// Share of a keyframe's landmarks that must be seen elsewhere, and by how many other keyframes.
@@ -17,6 +14,8 @@ const OTHERS: usize = 3;
 const COARSER: u8 = 1;
 /// The newest keyframes stay: what they see is still growing.
 const KEPT_NEWEST: usize = 5;
+/// Keyframes among which one is given up when memory is short.
+const EXAMINED: usize = 16;
 
 /// Culls the redundant ones among the keyframes that share landmarks with `around`. `keep` names those that must stay; the first
 /// keyframe of a submap and the newest ones stay as well. Returns the culled ones in the order in which they went.
@@ -50,6 +49,36 @@ fn is_redundant(map: &Map, keyframe: usize) -> bool {
     elsewhere as f64 >= REDUNDANT_SHARE * f64::from(seen) && seen > 0
 }
 
+/// Culls keyframes while the map is larger than `bytes`: one at a call, of the next few living ones after `from` the one of which others see most. So
+/// keyframes become sparser where many see the same. Returns the keyframe after which the next call goes on.
+pub fn thin(map: &mut Map, bytes: u64, from: usize, keep: impl Fn(usize) -> bool, config: &TrackingConfig) -> usize {
+    let oldest_kept = map.keyframes.len().saturating_sub(KEPT_NEWEST);
+    if map.bytes() <= bytes {
+        return from;
+    }
+    let may_go = |k: &usize| !map.is_root(*k) && !keep(*k);
+    let after = map.living.range(from + 1..oldest_kept.max(from + 1)).copied();
+    let mut examined: Vec<usize> = after.filter(may_go).take(EXAMINED).collect();
+    if examined.is_empty() {
+        examined = map.living.range(..oldest_kept).copied().filter(may_go).take(EXAMINED).collect();
+    }
+    let seen_elsewhere = |k: &usize| {
+        let seen = map.keyframes[*k].landmarks.iter().flatten();
+        let (mut all, mut elsewhere) = (0, 0);
+        for landmark in seen {
+            all += 1;
+            elsewhere += usize::from(map.landmarks[*landmark].observations.len() > 1);
+        }
+        f64::from(elsewhere as u32) / f64::from(all.max(1))
+    };
+    let shares: Vec<(usize, f64)> = examined.iter().map(|k| (*k, seen_elsewhere(k))).collect();
+    let most = shares.iter().max_by(|a, b| a.1.total_cmp(&b.1).then(b.0.cmp(&a.0)));
+    if let Some((keyframe, _)) = most {
+        cull(map, *keyframe, config);
+    }
+    examined.last().copied().unwrap_or(0)
+}
+
 /// Culls a keyframe; `false` if no other could be its parent.
 fn cull(map: &mut Map, keyframe: usize, config: &TrackingConfig) -> bool {
     let Some((parent, _)) = map.covisible(keyframe).first().copied() else { return false };
@@ -59,17 +88,18 @@ fn cull(map: &mut Map, keyframe: usize, config: &TrackingConfig) -> bool {
         map.refresh_geometry(landmark, config);
     }
     map.keyframes[keyframe].landmarks = Vec::new();
-    let features = std::mem::replace(&mut map.keyframes[keyframe].features, Arc::new(FrameFeatures::default()));
-    map.database.remove(keyframe, &features.features);
     map.attach(keyframe, parent);
     true
 }
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+
     use super::*;
     use crate::geometry::{Se3, se3};
     use crate::tracking::features::descriptor::Descriptor;
+    use crate::tracking::features::frame_features::FrameFeatures;
     use crate::tracking::features::frame_features::tests::feature;
     use crate::tracking::map::sparse_map::Keyframe;
     use crate::tracking::solvers::residual::tests::PINHOLE;
@@ -140,5 +170,22 @@ mod tests {
         for (k, pose) in poses.iter().enumerate() {
             assert!(se3::log(&(map.keyframes[k].camera_from_world * (pose * push).inverse())).norm() < 1e-9, "{k}");
         }
+    }
+
+    #[test]
+    fn a_map_beyond_its_memory_becomes_sparser_and_one_within_stays() {
+        let config = TrackingConfig::default();
+        let mut map = map(4, 2);
+        let bytes = map.bytes();
+        assert_eq!(thin(&mut map, bytes, 0, |_| false, &config), 0);
+        assert!(map.culled.is_empty());
+        let mut from = 0;
+        (0..20).for_each(|_| from = thin(&mut map, bytes / 4 * 3, from, |k| k == 2, &config));
+        assert!(map.bytes() <= bytes / 4 * 3, "{} of {bytes} bytes", map.bytes());
+        assert!(map.living.contains(&0) && map.living.contains(&2) && map.living.contains(&11));
+        assert!(map.living.contains(&3), "what it sees nobody else sees");
+        let least = map.living.len();
+        (0..20).for_each(|_| from = thin(&mut map, 0, from, |k| k == 2, &config));
+        assert!(map.living.len() < least && [0, 2, 7, 8, 9, 10, 11].iter().all(|k| map.living.contains(k)));
     }
 }

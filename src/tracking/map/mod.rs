@@ -5,6 +5,7 @@ pub mod keyframe;
 pub mod keyframe_culling;
 pub mod keyframe_database;
 pub mod landmark;
+pub mod prediction;
 pub mod sparse_map;
 pub mod tally;
 pub mod triangulation;

@@ -1,31 +1,29 @@
 //! The sparse map: keyframes, landmarks, who sees what, and the covisibility that follows from it.
 //!
-//! Everything is indexed by its place in a `Vec` (ids never change and are never reused), so every walk has one order. A culled keyframe
+//! Everything is indexed by its place in a `Vec`, so every walk has one order. The place of a landmark that ended is used again when no frame can name
+//! it any more; who names landmarks for longer checks by which keyframe they were made. A culled keyframe
 //! keeps its place and its pose, and nothing else. No walk but a correction's is over all of them: what a frame or a keyframe costs depends on what
 //! it sees.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 use nalgebra::{Point3, Vector3};
 
 use crate::geometry::Se3;
 use crate::tracking::TrackingConfig;
-use crate::tracking::features::descriptor::{Descriptor, representative};
-use crate::tracking::features::projection::Projection;
+use crate::tracking::features::frame_features::Feature;
 pub use crate::tracking::map::keyframe::{CulledKeyframe, Keyframe};
 use crate::tracking::map::keyframe_database::KeyframeDatabase;
 pub use crate::tracking::map::landmark::{Landmark, LandmarkState, Observation};
 use crate::tracking::map::tally::{distinct, tally};
-use crate::tracking::rig::Rig;
 
-/// A landmark is looked for only within 60° of the mean direction from which it was seen.
-const MIN_VIEW_COSINE: f64 = 0.5;
-/// Slack on the range of distances at which the pyramid can see a landmark.
-const RANGE_SLACK: f64 = 1.2;
-/// A landmark's descriptor is chosen among those of its latest observations.
-const DESCRIPTORS_COMPARED: usize = 10;
 /// Links that a keyframe keeps.
 const MOST_LINKS: usize = 5;
+/// Keyframes after the end of a landmark until its place is used again.
+const REUSED_AFTER: usize = 2;
+/// Host memory of a keyframe's feature: itself, its place in the grid, the landmark that it shows, the observation, its entry in the database.
+const BYTES_PER_FEATURE: usize = size_of::<Feature>() + 8 + size_of::<Option<usize>>() + 2 * size_of::<Observation>() + 48;
+const BYTES_PER_LANDMARK: usize = size_of::<Landmark>();
 
 #[derive(Clone, Debug, Default)]
 pub struct Map {
@@ -41,6 +39,13 @@ pub struct Map {
     pub corrections: usize,
     /// First keyframes of submaps that have not joined another.
     pub roots: BTreeSet<usize>,
+    /// Keyframes that have not been culled, and how many features they hold.
+    pub living: BTreeSet<usize>,
+    features: usize,
+    /// Landmarks on probation and the keyframes that made them, oldest first.
+    pub probation: VecDeque<(usize, usize)>,
+    /// Landmarks that are no more, and the number of keyframes when they ended, oldest first: their places are used again.
+    ended: VecDeque<(usize, usize)>,
 }
 
 impl Map {
@@ -63,6 +68,8 @@ impl Map {
             }
             self.landmarks.push(landmark);
         }
+        self.probation.extend(other.probation.iter().map(|(l, by)| (l + landmarks, by + keyframes)));
+        self.ended.extend(other.ended.iter().map(|(l, _)| (l + landmarks, self.keyframes.len())));
         (landmarks..self.landmarks.len()).for_each(|l| self.refresh_geometry(l, config));
     }
 
@@ -70,6 +77,8 @@ impl Map {
     pub fn push(&mut self, mut keyframe: Keyframe) -> usize {
         let id = self.keyframes.len();
         self.database.insert(id, &keyframe.features.features);
+        self.living.insert(id);
+        self.features += keyframe.features.len();
         if keyframe.root == id {
             self.roots.insert(id);
         }
@@ -111,8 +120,9 @@ impl Map {
 
     /// A landmark first seen by `observation`.
     pub fn add_landmark(&mut self, observation: Observation, position: Point3<f64>, config: &TrackingConfig) -> usize {
-        let id = self.landmarks.len();
-        self.landmarks.push(Landmark {
+        let may_reuse = self.ended.front().is_some_and(|(_, at)| *at + REUSED_AFTER <= self.keyframes.len());
+        let free = if may_reuse { self.ended.pop_front() } else { None };
+        let landmark = Landmark {
             anchor: observation.keyframe,
             in_anchor: Point3::origin(),
             descriptor: self.keyframes[observation.keyframe].features.features[observation.feature].descriptor,
@@ -123,7 +133,14 @@ impl Map {
             observable: 1,
             observed: 1,
             state: LandmarkState::Alive,
-        });
+        };
+        let id = free.map_or(self.landmarks.len(), |(id, _)| id);
+        if id == self.landmarks.len() {
+            self.landmarks.push(landmark);
+        } else {
+            self.landmarks[id] = landmark;
+        }
+        self.probation.push_back((id, observation.keyframe));
         self.keyframes[observation.keyframe].landmarks[observation.feature] = Some(id);
         self.set_position(id, &position);
         self.refresh_geometry(id, config);
@@ -146,7 +163,7 @@ impl Map {
         observations.retain(|s| *s != observation);
         match self.landmarks[landmark].observations.first() {
             Some(first) => self.hang_on(landmark, first.keyframe),
-            None => self.landmarks[landmark].state = LandmarkState::Removed,
+            None => self.end(landmark, LandmarkState::Removed),
         }
     }
 
@@ -169,7 +186,23 @@ impl Map {
         for observation in std::mem::take(&mut self.landmarks[landmark].observations) {
             self.keyframes[observation.keyframe].landmarks[observation.feature] = None;
         }
-        self.landmarks[landmark].state = LandmarkState::Removed;
+        self.end(landmark, LandmarkState::Removed);
+    }
+
+    fn end(&mut self, landmark: usize, state: LandmarkState) {
+        self.landmarks[landmark].state = state;
+        self.ended.push_back((landmark, self.keyframes.len()));
+    }
+
+    /// Whether a landmark is alive and the one that went by this id when there were `known` keyframes.
+    pub fn is_alive_since(&self, landmark: usize, known: usize) -> bool {
+        let l = &self.landmarks[landmark];
+        l.state == LandmarkState::Alive && l.first_keyframe < known
+    }
+
+    /// Host memory of what tracking keeps of keyframes and landmarks, bytes, by their number.
+    pub fn bytes(&self) -> u64 {
+        (self.features * BYTES_PER_FEATURE + self.landmarks.len() * BYTES_PER_LANDMARK) as u64
     }
 
     /// `from` is the same point as `into`, which takes over its observations.
@@ -185,7 +218,7 @@ impl Map {
             self.add_observation(into, observation);
         }
         let (observable, observed) = (self.landmarks[from].observable, self.landmarks[from].observed);
-        self.landmarks[from].state = LandmarkState::MergedInto(into);
+        self.end(from, LandmarkState::MergedInto(into));
         self.landmarks[into].observable += observable;
         self.landmarks[into].observed += observed;
     }
@@ -200,72 +233,6 @@ impl Map {
                 LandmarkState::MergedInto(next) => id = next,
             }
         }
-    }
-
-    /// Chooses a landmark's descriptor among its latest observations.
-    pub fn refresh_descriptor(&mut self, landmark: usize) {
-        let latest = self.landmarks[landmark].observations.iter().rev().take(DESCRIPTORS_COMPARED);
-        let descriptors: Vec<Descriptor> =
-            latest.map(|s| self.keyframes[s.keyframe].features.features[s.feature].descriptor).collect();
-        if let Some(descriptor) = representative(&descriptors) {
-            self.landmarks[landmark].descriptor = descriptor;
-        }
-    }
-
-    /// Works out again what follows from a landmark's position and observations: its direction and range.
-    pub fn refresh_geometry(&mut self, landmark: usize, config: &TrackingConfig) {
-        let l = &self.landmarks[landmark];
-        let (Some(first), LandmarkState::Alive) = (l.observations.first(), l.state) else { return };
-        let position = self.position(landmark);
-        let mut direction = Vector3::zeros();
-        for observation in &l.observations {
-            let line = position - self.keyframes[observation.keyframe].centre();
-            direction += line.try_normalize(1e-9).unwrap_or_default();
-        }
-        let anchor = &self.keyframes[first.keyframe];
-        let scale = |octave: usize| config.pyramid_scale.powi(octave as i32);
-        let octave = usize::from(anchor.features.features[first.feature].octave);
-        let furthest = l.in_anchor.coords.norm() * scale(octave);
-        let in_anchor = anchor.camera_from_world.rotation * direction;
-        let view_direction = in_anchor.try_normalize(1e-9).unwrap_or(l.view_direction);
-        let l = &mut self.landmarks[landmark];
-        l.view_direction = view_direction;
-        l.range = (furthest / scale(config.pyramid_levels - 1), furthest);
-    }
-
-    /// Projections of those landmarks that a camera should see, in their order; a projection's `point` is the landmark.
-    pub fn visible(&self, landmarks: impl IntoIterator<Item = usize>, camera_from_world: &Se3, rig: &Rig) -> Vec<Projection> {
-        landmarks.into_iter().filter_map(|landmark| self.predict(landmark, camera_from_world, rig)).collect()
-    }
-
-    /// Where a camera should see a landmark; `None` outside of its image, its range of distances or its viewing directions.
-    fn predict(&self, landmark: usize, camera_from_world: &Se3, rig: &Rig) -> Option<Projection> {
-        let Rig { pinhole, config } = rig;
-        let l = &self.landmarks[landmark];
-        let anchor = &self.keyframes[l.anchor];
-        let p_in_camera = (camera_from_world * self.position(landmark)).coords;
-        let pixel = pinhole.project(&p_in_camera).filter(|pixel| pinhole.contains(pixel, 0.0))?;
-        let distance = p_in_camera.norm();
-        let (nearest, furthest) = (l.range.0 * anchor.unit, l.range.1 * anchor.unit);
-        if distance < nearest / RANGE_SLACK || distance > furthest * RANGE_SLACK {
-            return None;
-        }
-        let line_of_sight = camera_from_world.rotation.inverse() * p_in_camera / distance;
-        let view_cosine = line_of_sight.dot(&(anchor.camera_from_world.rotation.inverse() * l.view_direction));
-        if view_cosine < MIN_VIEW_COSINE {
-            return None;
-        }
-        let octave = ((furthest / distance).ln() / config.pyramid_scale.ln()).ceil();
-        let octave = octave.clamp(0.0, config.pyramid_levels as f64 - 1.0) as u8;
-        Some(Projection {
-            point: landmark,
-            pixel,
-            octave,
-            view_cosine,
-            inverse_depth: 1.0 / p_in_camera.z,
-            descriptor: l.descriptor,
-            angle_rad: 0.0,
-        })
     }
 
     /// Keyframes that see the given landmarks and how many of them, most first, then newest first.
@@ -285,7 +252,7 @@ impl Map {
 
     /// The keyframes of a submap that have not been culled, in ascending order.
     pub fn living_in(&self, root: usize) -> impl Iterator<Item = usize> {
-        (0..self.keyframes.len()).filter(move |k| self.keyframes[*k].root == root && !self.culled.contains_key(k))
+        self.living.iter().copied().filter(move |k| self.keyframes[*k].root == root)
     }
 
     /// Whether all keyframes are of one submap.
@@ -313,8 +280,12 @@ impl Map {
         std::iter::once(keyframe).chain(self.carried.get(&keyframe).into_iter().flatten().copied())
     }
 
-    /// Attaches a keyframe, which has no landmarks any more, and what it carries to another one.
+    /// Gives up a keyframe, which has no landmarks any more: it and what it carries is attached to another one.
     pub fn attach(&mut self, keyframe: usize, parent: usize) {
+        let features = std::mem::take(&mut self.keyframes[keyframe].features);
+        self.database.remove(keyframe, &features.features);
+        self.living.remove(&keyframe);
+        self.features -= features.len();
         let carried = self.carried.remove(&keyframe).unwrap_or_default();
         for moved in std::iter::once(keyframe).chain(carried) {
             let camera_from_parent = self.keyframes[parent].relative(&self.keyframes[moved].camera_from_world);
@@ -345,29 +316,30 @@ impl Map {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
     use std::sync::Arc;
 
-    use nalgebra::Vector2;
-
+    use crate::tracking::features::descriptor::Descriptor;
     use crate::tracking::features::frame_features::FrameFeatures;
     use crate::tracking::features::frame_features::tests::feature;
     use crate::tracking::solvers::residual::tests::PINHOLE;
 
-    fn config() -> TrackingConfig {
+    pub fn config() -> TrackingConfig {
         TrackingConfig::default()
     }
 
     /// Three keyframes of ten features each, at one place.
-    fn map() -> Map {
+    pub fn map() -> Map {
         let list = (0..10).map(|i| feature(50.0 * f64::from(i), 100.0, Descriptor([1 << i, 0, 0, 0]))).collect();
         let features = Arc::new(FrameFeatures::new(list, &PINHOLE));
         let keyframe = Keyframe::new(0, 0.0, Se3::identity(), features);
-        Map { keyframes: vec![keyframe; 3], ..Default::default() }
+        let mut map = Map::default();
+        (0..3).for_each(|_| _ = map.push(keyframe.clone()));
+        map
     }
 
-    fn at(keyframe: usize, feature: usize) -> Observation {
+    pub fn at(keyframe: usize, feature: usize) -> Observation {
         Observation { keyframe, feature }
     }
 
@@ -391,19 +363,36 @@ mod tests {
     }
 
     #[test]
-    fn a_landmark_is_predicted_where_and_how_large_it_was_seen() {
+    fn the_place_of_a_landmark_that_ended_is_used_again_when_nobody_names_it() {
         let mut map = map();
-        let id = map.add_landmark(at(0, 1), Point3::new(0.0, 0.0, 2.0), &config());
-        let predict = |pose: &Se3| map.predict(id, pose, &Rig { pinhole: PINHOLE, config: config() });
-        let here = predict(&Se3::identity()).unwrap();
-        assert_eq!((here.octave, here.inverse_depth), (0, 0.5));
-        assert!((here.pixel - Vector2::new(320.5, 241.0)).norm() < 1e-9);
-        // Half the distance shows it twice as large: 4 levels of 1.2 up.
-        assert_eq!(predict(&Se3::translation(0.0, 0.0, -1.0)).unwrap().octave, 4);
-        assert!(predict(&Se3::translation(0.0, 0.0, 2.0)).is_none(), "too small to see");
-        assert!(predict(&Se3::translation(9.0, 0.0, 0.0)).is_none(), "out of the image");
-        // From behind.
-        let behind = Se3::new(Vector3::new(0.0, 0.0, 4.0), Vector3::y() * std::f64::consts::PI);
-        assert!(predict(&behind).is_none());
+        let first = map.add_landmark(at(0, 1), Point3::new(0.0, 0.0, 2.0), &config());
+        let known = map.keyframes.len();
+        map.remove_landmark(first);
+        let second = map.add_landmark(at(1, 2), Point3::new(0.0, 1.0, 2.0), &config());
+        assert_ne!(first, second);
+        (0..REUSED_AFTER).for_each(|_| _ = map.push(map.keyframes[0].clone()));
+        let third = map.add_landmark(at(4, 3), Point3::new(1.0, 0.0, 2.0), &config());
+        assert_eq!((third, map.landmarks.len()), (first, 2));
+        assert!(map.is_alive_since(second, known) && !map.is_alive_since(third, known));
+        assert_eq!(map.position(third), Point3::new(1.0, 0.0, 2.0));
+    }
+
+    #[test]
+    fn what_hangs_on_a_keyframe_goes_with_it() {
+        let mut map = map();
+        let id = map.add_landmark(at(1, 1), Point3::new(0.5, 0.0, 2.0), &config());
+        map.add_observation(id, at(2, 4));
+        map.keyframes[1].unit = 2.0;
+        map.set_position(id, &Point3::new(0.5, 0.0, 2.0));
+        map.keyframes[0].landmarks.clear();
+        map.attach(0, 1);
+        let push = Se3::translation(0.0, 0.3, 0.0);
+        map.set_pose(1, push);
+        assert!((map.position(id) - Point3::new(0.5, -0.3, 2.0)).norm() < 1e-12);
+        assert!((map.keyframes[0].centre() - map.keyframes[1].centre()).norm() < 1e-12 && map.living(0) == 1);
+        // Its next anchor takes it over where it is.
+        map.remove_observation(id, at(1, 1));
+        map.set_pose(1, Se3::identity());
+        assert!((map.position(id) - Point3::new(0.5, -0.3, 2.0)).norm() < 1e-12 && map.landmarks[id].anchor == 2);
     }
 }

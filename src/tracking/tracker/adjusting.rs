@@ -10,7 +10,7 @@ use std::time::Instant;
 use super::{Tracker, milliseconds};
 use crate::sequence::Sensor;
 use crate::tracking::adjustment::local_bundle::Adjustment;
-use crate::tracking::map::keyframe_culling::cull_around;
+use crate::tracking::map::keyframe_culling::{cull_around, thin};
 use crate::tracking::worker::Worker;
 use crate::tracking::{KeyframeUpdate, StageTimes, TrackingError};
 
@@ -33,6 +33,8 @@ pub(super) struct Adjusting {
     waiting: Option<Waiting>,
     /// Real time: keyframes that came before it and are still to be searched for loops.
     overtaken: Vec<usize>,
+    /// Where thinning goes on.
+    thinned: usize,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -52,7 +54,16 @@ struct Waiting {
 
 impl Adjusting {
     pub fn new(worker: Worker<Adjustment>) -> Self {
-        Self { worker, real_time: false, newest_at: 0, interval: 0, under_way: None, waiting: None, overtaken: Vec::new() }
+        Self {
+            worker,
+            real_time: false,
+            newest_at: 0,
+            interval: 0,
+            under_way: None,
+            waiting: None,
+            overtaken: Vec::new(),
+            thinned: 0,
+        }
     }
 }
 
@@ -160,6 +171,8 @@ impl Tracker {
         let clock = Instant::now();
         if !closed && self.rig.config.keyframe_culling {
             cull_around(&mut self.map, keyframe, |k| self.loops.holds(k), &self.rig.config);
+            let most = self.rig.config.max_host_bytes;
+            self.adjusting.thinned = thin(&mut self.map, most, self.adjusting.thinned, |k| self.loops.holds(k), &self.rig.config);
             self.motion.reference = self.map.living(self.motion.reference);
         }
         times.mapping_ms += milliseconds(clock);

@@ -15,7 +15,7 @@ use std::time::Instant;
 
 /// Deterministic replay: keyframes of a correction, and observations of an adjustment, that the thread has to itself a frame for.
 const KEYFRAMES_A_FRAME: usize = 8;
-const OBSERVATIONS_A_FRAME: usize = 2000;
+const OBSERVATIONS_A_FRAME: usize = 500;
 /// Of the keyframes that a correction has moved, every so many gets a window of its own.
 const WINDOW_EVERY: usize = 4;
 

@@ -19,7 +19,8 @@ const LOW_OVERLAP: f64 = 0.25;
 /// Whether a tracked frame should become a keyframe; `reference` is the keyframe that shares most landmarks with it.
 pub fn is_due(map: &Map, frame: &FrameFeatures, found: &Localised, reference: usize, config: &TrackingConfig) -> bool {
     let view = &map.keyframes[reference];
-    let observations = if map.keyframes.len() < YOUNG_MAP { 1 } else { 2 };
+    // The newest submap, in which all this happens, has all keyframes since its first.
+    let observations = if map.keyframes.len() - view.root < YOUNG_MAP { 1 } else { 2 };
     let expected = view.landmark_count(map, observations);
     let overlap = found.inliers as f64 / expected.max(1) as f64;
 

@@ -242,6 +242,11 @@ impl Tracker {
         self.map.keyframes.len()
     }
 
+    /// Host memory of the tracker's map, bytes, as `tracking.max_host_bytes` bounds it.
+    pub fn map_bytes(&self) -> u64 {
+        self.map.bytes()
+    }
+
     /// How many keyframes have not been culled.
     pub fn living_keyframes(&self) -> usize {
         self.map.keyframes.len() - self.map.culled.len()

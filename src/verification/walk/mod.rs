@@ -74,7 +74,7 @@ impl World {
                 half_width: 1.2,
                 height: 2.5,
                 crossings: 12,
-                points: 150.0,
+                points: 250.0,
                 step: 0.033,
                 frames_per_s: 30.0,
                 sight: 9.0,
