@@ -6,7 +6,7 @@ use crate::config::{Config, ConfigError};
 use crate::evaluation::image::WINDOW as SSIM_WINDOW;
 use crate::evaluation::trajectory::MAX_TIME_DIFFERENCE_S;
 use crate::geometry::{Pinhole, Se3};
-use crate::sequence::{Sensor, Sequence, SequenceError};
+use crate::sequence::{ASSUMED_CAMERA, Sensor, Sequence, SequenceError};
 
 /// A selection of a sequence's frames and the configuration that maps them. Immutable: a change makes a new value.
 #[derive(Clone, Debug)]
@@ -21,6 +21,11 @@ pub enum RecordingError {
     /// `sequence` is absent from the configuration.
     #[error("the configuration names no recording; give its folder or video")]
     Unnamed,
+    /// `sequence.camera` is `auto`.
+    #[error(
+        "sequence.camera is `auto`, which is no camera yet: find it by `keysplat calibrate` and name the camera.toml that it writes"
+    )]
+    Uncalibrated,
     /// A configuration value is out of its range.
     #[error(transparent)]
     Config(#[from] ConfigError),
@@ -77,6 +82,9 @@ impl Recording {
     pub fn open(mut config: Config) -> Result<Self, RecordingError> {
         config.validate()?;
         let named = config.sequence.as_ref().ok_or(RecordingError::Unnamed)?;
+        if named.camera.as_deref() == Some(ASSUMED_CAMERA) {
+            return Err(RecordingError::Uncalibrated);
+        }
         if named.path.is_file() {
             tracing::info!("decoding {} for the times of its frames", named.path.display());
         }

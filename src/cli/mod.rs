@@ -2,6 +2,7 @@
 
 mod adapters;
 mod bench;
+mod calibrate;
 mod check;
 mod demo;
 mod eval;
@@ -46,6 +47,8 @@ enum LogFormat {
 enum Command {
     /// Say what a recording holds and what in it looks wrong, before a run.
     Check(check::CheckArgs),
+    /// Find the camera of a recording that comes without a calibration, from its frames.
+    Calibrate(calibrate::CalibrateArgs),
     /// Replay a recording into a trajectory and a map.
     Run(run::RunArgs),
     /// Go on with a run that was interrupted and kept checkpoints.
@@ -98,6 +101,7 @@ pub fn main() -> ExitCode {
 fn execute(command: Command, verbosity: Verbosity) -> miette::Result<()> {
     match command {
         Command::Check(args) => check::check(&args, verbosity),
+        Command::Calibrate(args) => calibrate::calibrate(&args, verbosity),
         Command::Run(args) => run::run(&args, verbosity),
         Command::Resume(args) => resume::resume(&args, verbosity),
         Command::Demo(args) => demo::demo(&args, verbosity),

@@ -10,14 +10,15 @@ use indicatif::ProgressBar;
 use keysplat::config::SequenceConfig;
 use keysplat::export::MapFormat;
 use keysplat::presets::{self, Preset};
-use keysplat::sequence::is_camera_file;
+use keysplat::sequence::{ASSUMED_CAMERA, is_camera_file};
 use keysplat::{Config, Gpu, Progress, Recording, Session, SessionError};
 use miette::{IntoDiagnostic, miette};
 
+use super::calibrate::find_camera;
 use super::source::SourceArgs;
 use super::{Verbosity, print_metrics, progress};
 
-#[derive(Args)]
+#[derive(Args, Clone)]
 pub struct RunArgs {
     /// Folder of the recording, or a video; may also stand in the configuration.
     sequence: Option<PathBuf>,
@@ -97,7 +98,7 @@ fn parse_bytes(text: &str) -> Result<u64, String> {
 /// Where a range without an end ends; TOML's numbers go no further.
 const OPEN_END: usize = i64::MAX as usize;
 
-fn parse_range(text: &str) -> Result<(usize, usize), String> {
+pub fn parse_range(text: &str) -> Result<(usize, usize), String> {
     let wrong = || format!("`{text}` is no range; write A..B, like 0..200, with A below B");
     let (start, end) = text.split_once("..").ok_or_else(wrong)?;
     let number = |part: &str, default| if part.is_empty() { Ok(default) } else { part.parse().map_err(|_| wrong()) };
@@ -163,6 +164,14 @@ impl RunArgs {
 }
 
 pub fn run(args: &RunArgs, verbosity: Verbosity) -> miette::Result<()> {
+    let mut args = args.clone();
+    if args.source.camera.as_deref() == Some(ASSUMED_CAMERA) {
+        let path = args.sequence.as_deref().ok_or_else(|| miette!("--camera auto needs the recording's folder or video"))?;
+        std::fs::create_dir_all(&args.out).into_diagnostic()?;
+        let file = args.out.join("camera.toml");
+        find_camera(path, args.source.layout, args.frames, &file, verbosity)?;
+        args.source.camera = Some(file.to_string_lossy().into_owned());
+    }
     let (recording, gpu) = args.open()?;
     replay(Session::with_device(recording, gpu, &args.out).into_diagnostic()?, verbosity)
 }

@@ -3,7 +3,7 @@
 use clap::Args;
 use keysplat::sequence::{Layout, SensorKind};
 
-#[derive(Args)]
+#[derive(Args, Clone)]
 pub struct SourceArgs {
     /// Layout of the recording, where it isn't recognised.
     #[arg(long, value_enum)]
@@ -11,7 +11,8 @@ pub struct SourceArgs {
     /// Use of the recording only what a sensor of this kind gives.
     #[arg(long, value_enum)]
     pub sensor: Option<SensorKind>,
-    /// Camera preset to use instead of the recording's own calibration; for a video, or the path of a camera.toml.
+    /// Camera preset or path of a camera.toml to use instead of the recording's own calibration. `auto` finds the camera from the first frames, for
+    /// recordings that come without one.
     #[arg(long)]
     pub camera: Option<String>,
 }

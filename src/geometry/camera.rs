@@ -122,7 +122,18 @@ pub struct Camera {
     pub depth_units_per_metre: f64,
 }
 
+/// Focal length of a usual lens, as a share of the image's larger side.
+const USUAL_FOCAL: f64 = 0.9;
+
 impl Camera {
+    /// A usual lens without distortion, for images whose camera is not known.
+    pub fn assumed(width: u32, height: u32) -> Self {
+        let focal = USUAL_FOCAL * f64::from(width.max(height));
+        let (cx, cy) = (f64::from(width) / 2.0 - 0.5, f64::from(height) / 2.0 - 0.5);
+        let pinhole = Pinhole { fx: focal, fy: focal, cx, cy, width, height };
+        Self { pinhole, distortion: Distortion::default(), depth_units_per_metre: 1000.0 }
+    }
+
     /// Recorded pixel → pixel of the distortion-free pinhole with the same intrinsics.
     pub fn undistort_pixel(&self, pixel: &Vector2<f64>) -> Vector2<f64> {
         if self.distortion.is_zero() {

@@ -1,6 +1,7 @@
 //! Camera presets of known datasets, from `sequences/cameras.toml`.
 
 use std::collections::BTreeMap;
+use std::path::Path;
 use std::sync::LazyLock;
 
 use serde::Deserialize;
@@ -35,6 +36,15 @@ pub fn names() -> Vec<&'static str> {
 /// Whether `name` is the path of a camera's file rather than a preset's name.
 pub fn is_file(name: &str) -> bool {
     name.ends_with(".toml")
+}
+
+/// Name of the camera that is not known: a usual lens, for images of which the calibration is to be found.
+pub const ASSUMED: &str = "auto";
+
+/// A usual lens for images of this one's size.
+pub fn assumed_for(image: &Path) -> Result<Camera, SequenceError> {
+    let size = image::image_dimensions(image).map_err(|source| SequenceError::Image { path: image.into(), source })?;
+    Ok(Camera::assumed(size.0, size.1))
 }
 
 /// The preset called `name`.

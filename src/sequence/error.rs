@@ -95,7 +95,7 @@ pub enum SequenceError {
         example: String,
     },
     /// The recording comes without a calibration.
-    #[error("{folder}: no camera.txt, and the folder's name says no known camera ({known}); add camera.txt with `fx fy cx cy width height depth_units_per_metre k1 k2 p1 p2`, or name one with --camera", known = cameras::names().join(", "))]
+    #[error("{folder}: no camera.txt, and the folder's name says no known camera ({known}); add camera.txt with `fx fy cx cy width height depth_units_per_metre k1 k2 p1 p2`, name one with --camera, or let it be found with --camera auto", known = cameras::names().join(", "))]
     NoCamera {
         /// The recording.
         folder: PathBuf,

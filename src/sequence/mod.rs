@@ -22,7 +22,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::geometry::{Camera, Trajectory};
 
-pub use cameras::is_file as is_camera_file;
+pub use cameras::{ASSUMED as ASSUMED_CAMERA, is_file as is_camera_file};
 pub use error::SequenceError;
 use files::{decode, existing, files_in, folder_name, images_in, parse_json, read_text};
 pub use layouts::Layout;
@@ -178,7 +178,8 @@ const NOT_MEASURED: u16 = u16::MAX;
 impl Sequence {
     /// Opens a recording, a folder or a video: finds its layout unless named, reads and checks its lists, camera and truth. No image is
     /// decoded, but a video is, once, for the times of its frames.
-    /// `camera` names a preset (`tum-fr1`, …) to use instead of what a folder in TUM's layout says; for a video, also a `camera.toml`.
+    /// `camera` names a preset (`tum-fr1`, …), a `camera.toml`, or [`ASSUMED_CAMERA`], to use instead of what a video or a folder of images or in TUM's
+    /// layout says.
     ///
     /// # Errors
     /// [`SequenceError`] if the recording does not exist, has no known layout or camera, or a file of it is damaged; the message names the file.
@@ -190,7 +191,13 @@ impl Sequence {
         if !folder.is_dir() {
             return Err(SequenceError::Missing(folder.into()));
         }
-        let layout = layout.or_else(|| Layout::recognise(folder)).ok_or_else(|| SequenceError::UnknownLayout(folder.into()))?;
+        // What a plain folder of images lacks to be recognised, the camera's name gives.
+        let bare =
+            || camera.filter(|name| *name == ASSUMED_CAMERA || is_camera_file(name)).and_then(|_| Layout::by_name("images"));
+        let layout = layout
+            .or_else(|| Layout::recognise(folder))
+            .or_else(bare)
+            .ok_or_else(|| SequenceError::UnknownLayout(folder.into()))?;
         layout.open(folder, camera)
     }
 

@@ -17,6 +17,7 @@ mod localisation;
 mod loop_closing;
 pub(crate) mod map;
 mod rig;
+mod self_calibration;
 pub(crate) mod solvers;
 pub(crate) mod structure;
 mod tracker;
@@ -26,6 +27,7 @@ pub use config::TrackingConfig;
 pub use error::TrackingError;
 pub use front_end::{ExtractedFrame, FrontEnd};
 pub use loop_closing::ClosedLoop;
+pub use self_calibration::{SelfCalibration, SelfCalibrationError, self_calibrate};
 pub use tracker::Tracker;
 
 use nalgebra::Vector2;

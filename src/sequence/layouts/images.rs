@@ -27,7 +27,7 @@ use serde::Deserialize;
 
 use super::row::{LayoutRow, parse_text};
 use crate::geometry::{Camera, Distortion, Pinhole};
-use crate::sequence::{FrameEntry, Sensor, Sequence, SequenceError, checks, folder_name, images_in, read_text};
+use crate::sequence::{FrameEntry, Sensor, Sequence, SequenceError, cameras, checks, folder_name, images_in, read_text};
 
 pub(super) const FILE: &str = "camera.toml";
 
@@ -60,7 +60,7 @@ pub(super) const LAYOUT: LayoutRow = LayoutRow {
     help: "`camera.toml` and images in the folder itself, in `rgb` and optionally `depth`, or in `left` and `right`.",
     is_photos: false,
     recognise,
-    open: |folder, _| open(folder),
+    open,
     parse: |bytes| parse_text(bytes, |text, path| vec![parse_camera(text, path).map(drop)]),
 };
 
@@ -68,11 +68,17 @@ pub(super) fn recognise(folder: &Path) -> bool {
     folder.join(FILE).is_file()
 }
 
-fn open(folder: &Path) -> Result<Sequence, SequenceError> {
-    let path = folder.join(FILE);
+fn open(folder: &Path, named: Option<&str>) -> Result<Sequence, SequenceError> {
+    let rgb = folder.join("rgb");
+    if named == Some(cameras::ASSUMED) {
+        let images = if rgb.is_dir() { rgb } else { folder.into() };
+        let entries = entries(&images, Path::new(""), Sensor::Mono, usual_fps())?;
+        let camera = cameras::assumed_for(&entries[0].color)?;
+        return Ok(Sequence::new(folder_name(folder), &LAYOUT, camera, Sensor::Mono, entries));
+    }
+    let path = named.filter(|name| cameras::is_file(name)).map_or_else(|| folder.join(FILE), PathBuf::from);
     let content = |what: &str| SequenceError::Content { path: path.clone(), what: what.into() };
     let (camera, file) = parse_camera(&read_text(&path)?, &path)?;
-    let rgb = folder.join("rgb");
     let (color_folder, other_folder, sensor) = match file.stereo {
         Some(StereoTable { baseline_metres }) => {
             if !(baseline_metres.is_finite() && baseline_metres > 0.0) {

@@ -5,6 +5,7 @@
 
 use std::path::{Path, PathBuf};
 
+use super::images;
 use super::row::{LayoutRow, parse_text};
 use crate::geometry::{Camera, Distortion, Pinhole, Trajectory};
 use crate::sequence::{FrameEntry, Sensor, Sequence, SequenceError, cameras, folder_name, read_text};
@@ -34,6 +35,12 @@ pub(super) const LAYOUT: LayoutRow = LayoutRow {
 fn open(folder: &Path, camera: Option<&str>) -> Result<Sequence, SequenceError> {
     let name = folder_name(folder);
     let camera = match camera {
+        Some(cameras::ASSUMED) => {
+            let colors = read_list(folder, "rgb.txt")?;
+            let first = colors.first().ok_or_else(|| SequenceError::Empty { path: folder.join("rgb.txt") })?;
+            cameras::assumed_for(&first.path)?
+        }
+        Some(file) if cameras::is_file(file) => images::parse_camera(&read_text(Path::new(file))?, Path::new(file))?.0,
         Some(preset) => cameras::by_name(preset)?,
         None if folder.join("camera.txt").is_file() => {
             let path = folder.join("camera.txt");

@@ -2,6 +2,7 @@
 
 pub mod bundle;
 pub mod epipolar;
+pub mod intrinsics;
 pub mod pose;
 pub mod pose_graph;
 pub mod residual;

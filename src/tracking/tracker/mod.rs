@@ -242,6 +242,10 @@ impl Tracker {
         self.map.keyframes.len()
     }
 
+    pub(in crate::tracking) fn map(&self) -> &Map {
+        &self.map
+    }
+
     /// Host memory of the tracker's map, bytes, as `tracking.max_host_bytes` bounds it.
     pub fn map_bytes(&self) -> u64 {
         self.map.bytes()

@@ -54,7 +54,7 @@ impl Tracker {
     }
 
     /// The first keyframe of the submap in which most frames have their poses; of equals the oldest.
-    pub(super) fn largest_submap(&self) -> usize {
+    pub(in crate::tracking) fn largest_submap(&self) -> usize {
         let mut frames: BTreeMap<usize, usize> = BTreeMap::new();
         for record in &self.records {
             *frames.entry(self.map.keyframes[record.reference].root).or_default() += 1;

@@ -11,6 +11,7 @@ mod decoder;
 #[cfg(test)]
 mod tests;
 
+use std::cell::Cell;
 use std::fs::File;
 use std::io::Cursor;
 use std::path::{Path, PathBuf};
@@ -60,11 +61,17 @@ fn open(path: &Path, camera: Option<&str>) -> Result<Sequence, SequenceError> {
     let read_error = |source| SequenceError::Read { path: path.clone(), source };
     let mut file = File::open(&path).map_err(read_error)?;
     let container = Container::of(&file).map_err(read_error)?.ok_or_else(|| SequenceError::NoVideo { path: path.clone() })?;
-    let (camera, usual_fps) = camera_of(&path, camera)?;
+    let is_assumed = camera == Some(cameras::ASSUMED);
+    let (mut camera, usual_fps) =
+        if is_assumed { (Camera::assumed(1, 1), images::usual_fps()) } else { camera_of(&path, camera)? };
     let name = path.file_stem().map_or_else(|| "video".into(), |stem| stem.to_string_lossy().into_owned());
-    let mut sequence = Sequence::new(name, &LAYOUT, camera, Sensor::Mono, Vec::new());
     let is_cut = container.is_cut(&mut file).map_err(read_error)?;
+    let filmed = Cell::new((1, 1));
     let check_size = |(width, height)| {
+        filmed.set((width, height));
+        if is_assumed {
+            return Ok(());
+        }
         if (height, width) == (camera.pinhole.width, camera.pinhole.height) && width != height {
             let what = format!("was filmed as {width}x{height}, whichever way players turn it; calibrate the camera for that");
             return Err(SequenceError::Content { path: path.clone(), what });
@@ -72,6 +79,10 @@ fn open(path: &Path, camera: Option<&str>) -> Result<Sequence, SequenceError> {
         crate::sequence::check_size(&camera, &path, (width, height))
     };
     let video = Video::scan(&path, is_cut, usual_fps, &check_size)?;
+    if is_assumed {
+        camera = Camera::assumed(filmed.get().0, filmed.get().1);
+    }
+    let mut sequence = Sequence::new(name, &LAYOUT, camera, Sensor::Mono, Vec::new());
     let entry = |&timestamp_s| FrameEntry { timestamp_s, color: path.clone(), ..FrameEntry::default() };
     sequence.entries = video.times_s.iter().map(entry).collect();
     sequence.video = Some(Arc::new(video));
@@ -96,7 +107,7 @@ fn camera_of(video: &Path, named: Option<&str>) -> Result<(Camera, f64), Sequenc
         None => video.with_file_name(images::FILE),
     };
     if named.is_none() && !path.is_file() {
-        let what = "there is no camera.toml beside this video; write one with fps and pinhole, or name one with --camera";
+        let what = "there is no camera.toml beside this video; write one with fps and pinhole, name one with --camera, or let it be found with --camera auto";
         return Err(SequenceError::Content { path: video.into(), what: what.into() });
     }
     let (camera, file) = images::parse_camera(&read_text(&path)?, &path)?;
