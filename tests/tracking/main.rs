@@ -6,4 +6,5 @@ mod common;
 mod evo;
 mod recordings;
 mod regression;
+mod self_calibration;
 mod walks;
