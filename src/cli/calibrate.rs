@@ -14,7 +14,7 @@ use super::run::parse_range;
 use super::{Verbosity, print, progress};
 
 /// Frames that a calibration takes, where no range is given.
-const FRAMES: usize = 600;
+pub const FRAMES: usize = 600;
 const AHEAD: usize = 8;
 
 #[derive(Args)]
@@ -41,6 +41,9 @@ struct CameraFile {
 }
 
 pub fn calibrate(args: &CalibrateArgs, verbosity: Verbosity) -> miette::Result<()> {
+    if args.out.exists() {
+        return Err(miette!("{} exists; name another file with --out, or remove it", args.out.display()));
+    }
     let found = find_camera(&args.sequence, args.layout, args.frames, &args.out, verbosity)?;
     if verbosity.quiet { Ok(()) } else { print(&format!("{}, in {}\n", describe(&found), args.out.display())) }
 }
@@ -61,6 +64,9 @@ pub fn find_camera(
         return Err(miette!("{} has {len} frames; give --frames within them", path.display()));
     }
     let Pinhole { width, height, .. } = sequence.camera.pinhole;
+    if sequence.camera != Camera::assumed(width, height) {
+        return Err(miette!("{} has a calibration, which its layout always uses: leave --camera out", path.display()));
+    }
     let config = TrackingConfig::default();
     let front_end = FrontEnd::new(Camera::assumed(width, height), sequence.sensor, &config);
     let bar = progress::bar(verbosity, (end - start) as u64, "{wide_bar} {pos}/{len} frames read");

@@ -14,7 +14,7 @@ use keysplat::sequence::{ASSUMED_CAMERA, is_camera_file};
 use keysplat::{Config, Gpu, Progress, Recording, Session, SessionError};
 use miette::{IntoDiagnostic, miette};
 
-use super::calibrate::find_camera;
+use super::calibrate::{self, find_camera};
 use super::source::SourceArgs;
 use super::{Verbosity, print_metrics, progress};
 
@@ -95,6 +95,8 @@ fn parse_bytes(text: &str) -> Result<u64, String> {
     bytes.ok_or_else(|| format!("`{text}` is no amount of memory; write 500M or 2G"))
 }
 
+/// Host memory that the tracker has at least.
+const LEAST_TRACKING_BYTES: u64 = 64 << 20;
 /// Where a range without an end ends; TOML's numbers go no further.
 const OPEN_END: usize = i64::MAX as usize;
 
@@ -156,7 +158,7 @@ impl RunArgs {
         config.mapping.limits.max_gaussians = self.max_gaussians.or(config.mapping.limits.max_gaussians);
         config.mapping.limits.max_gpu_bytes = self.max_gpu_memory.or(config.mapping.limits.max_gpu_bytes);
         if let Some(bytes) = self.max_host_memory {
-            config.tracking.max_host_bytes = bytes / 4;
+            config.tracking.max_host_bytes = (bytes / 4).max(LEAST_TRACKING_BYTES);
             config.mapping.limits.max_host_bytes = bytes - bytes / 4;
         }
         config.with_settings(&self.set).into_diagnostic()
@@ -169,7 +171,8 @@ pub fn run(args: &RunArgs, verbosity: Verbosity) -> miette::Result<()> {
         let path = args.sequence.as_deref().ok_or_else(|| miette!("--camera auto needs the recording's folder or video"))?;
         std::fs::create_dir_all(&args.out).into_diagnostic()?;
         let file = args.out.join("camera.toml");
-        find_camera(path, args.source.layout, args.frames, &file, verbosity)?;
+        let range = args.frames.map(|(start, end)| (start, end.min(start.saturating_add(calibrate::FRAMES))));
+        find_camera(path, args.source.layout, range, &file, verbosity)?;
         args.source.camera = Some(file.to_string_lossy().into_owned());
     }
     let (recording, gpu) = args.open()?;

@@ -12,6 +12,9 @@ use crate::tracking::{ExtractedFrame, FrontEnd, TrackingError};
 /// Frames decoded and extracted at the same time, at most: as many as there are processors, up to this.
 const MOST_AT_ONCE: usize = 8;
 
+/// Real time: a frame that has waited so long for its decoder is dropped.
+const LATE_AFTER: Duration = Duration::from_millis(250);
+
 /// A frame on its way to the tracking thread.
 #[derive(Debug)]
 pub(super) struct QueuedFrame {
@@ -25,7 +28,7 @@ pub(super) struct QueuedFrame {
 pub(super) struct ReadSummary {
     pub read_failed: usize,
     pub first_failure: Option<String>,
-    /// Real time: frames that became due while the channel was full.
+    /// Real time: frames that became due while the channel was full, or were decoded too late.
     pub late: usize,
 }
 
@@ -52,11 +55,20 @@ impl<'a> ReadThread<'a> {
         let mut summary = ReadSummary::default();
         let started = Instant::now();
         let first_s = self.sequence.entries.first().map_or(0.0, |entry| entry.timestamp_s);
-        let prepare = |frame: Frame| QueuedFrame { extracted: self.front_end.as_ref().map(|f| f.extract(&frame)), frame };
+        let due = |frame: &Frame| Duration::try_from_secs_f64(frame.timestamp_s - first_s).unwrap_or_default();
+        let prepare = |frame: Frame| {
+            // What is late already is not worth its features.
+            let is_late = self.real_time && started.elapsed() > due(&frame) + LATE_AFTER;
+            (!is_late).then(|| QueuedFrame { extracted: self.front_end.as_ref().map(|f| f.extract(&frame)), frame })
+        };
         let ahead = rayon::current_num_threads().min(MOST_AT_ONCE);
         self.sequence.read_ahead(0..self.sequence.entries.len(), ahead, prepare, |index, loaded| {
             let queued = match loaded {
-                Ok(queued) => queued,
+                Ok(Some(queued)) => queued,
+                Ok(None) => {
+                    summary.late += 1;
+                    return !self.progress.stopped();
+                }
                 Err(error) => {
                     tracing::warn!(frame = index, "skipped, it cannot be read: {error}");
                     summary.read_failed += 1;
@@ -65,8 +77,7 @@ impl<'a> ReadThread<'a> {
                 }
             };
             if self.real_time {
-                let due = Duration::try_from_secs_f64(queued.frame.timestamp_s - first_s).unwrap_or_default();
-                std::thread::sleep(due.saturating_sub(started.elapsed()));
+                std::thread::sleep(due(&queued.frame).saturating_sub(started.elapsed()));
                 match self.sender.try_send(queued) {
                     Ok(()) => {}
                     Err(TrySendError::Full(_)) => summary.late += 1,

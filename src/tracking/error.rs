@@ -34,7 +34,7 @@ pub enum TrackingError {
     /// The system gave no thread.
     #[error("a thread of the tracker could not be started: {0}")]
     Spawn(#[source] std::io::Error),
-    /// The adjustment thread panicked.
+    /// A solver thread panicked.
     #[error("a thread of the tracker panicked; what was tracked until then is kept. Please report this")]
     Adjusting,
     /// OpenCV failed.

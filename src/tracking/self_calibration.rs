@@ -23,7 +23,7 @@ const MOST_MAPS: usize = 6;
 /// Changes of the focal length (as a share) and of the distortion up to which a map was made with about the right lens.
 const NEAR_FOCAL: f64 = 0.05;
 const NEAR_K1: f64 = 0.05;
-/// Keyframes that an answer needs, and of which one is made, at most.
+/// Keyframes that an answer needs, and of which one is made, at most: the first ones.
 const LEAST_KEYFRAMES: usize = 6;
 const MOST_KEYFRAMES: usize = 60;
 /// Landmarks that fewer keyframes see say little.
@@ -110,7 +110,6 @@ pub fn self_calibrate(
             if !PLAUSIBLE.contains(&(focal / side)) {
                 break;
             }
-            least_deviation = least_deviation.min(estimate.deviation.focal);
             maps += 1;
             if !lens.is_near(&estimate.lens) && maps < MOST_MAPS {
                 // The lens has bent this map.
@@ -123,9 +122,11 @@ pub fn self_calibrate(
             lens = Lens { focal: mean(&|e| e.lens.focal.ln()).exp(), k1: mean(&|e| e.lens.k1) };
             if estimates.len() == ROUNDS {
                 let found = combine(&estimates, lens, (width, height), config);
-                if found.focal_sigma < MOST_DEVIATION * lens.focal {
+                let deviation = found.focal_sigma / lens.focal;
+                if deviation < MOST_DEVIATION {
                     return Ok(found);
                 }
+                least_deviation = least_deviation.min(deviation);
                 break;
             }
         }
@@ -175,9 +176,7 @@ fn adjust(
     }
     tracker.finish()?;
     let map = tracker.map();
-    let keyframes: Vec<usize> = map.living_in(tracker.largest_submap()).collect();
-    let every = keyframes.len().div_ceil(MOST_KEYFRAMES).max(1);
-    let keyframes: Vec<usize> = keyframes.into_iter().step_by(every).collect();
+    let keyframes: Vec<usize> = map.living_in(tracker.largest_submap()).take(MOST_KEYFRAMES).collect();
     if keyframes.len() < LEAST_KEYFRAMES {
         return Ok(None);
     }
@@ -209,6 +208,7 @@ fn adjust(
         }
         problem.points.push(map.position(landmark));
     }
+    problem.drop_hidden();
     problem.solve(STEPS);
     problem.drop_outliers();
     let Some(deviation) = problem.solve(STEPS) else { return Ok(None) };

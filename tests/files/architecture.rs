@@ -52,7 +52,7 @@ const ALLOWED: [(&str, &[&str]); 23] = [
             "pipeline",
         ],
     ),
-    ("verification", &["geometry", "splat", "tracking", "gpu", "render", "optimise"]),
+    ("verification", &["geometry", "sequence", "splat", "tracking", "gpu", "render", "optimise"]),
     ("cli", EVERYTHING_ABOVE),
 ];
 

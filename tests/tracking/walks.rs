@@ -23,7 +23,8 @@ fn walk(world: World, frames: usize, config: &TrackingConfig) -> Walked {
     }
     tracker.finish().unwrap();
     let keyframes = tracker.keyframes();
-    let true_pose = |id: usize| truth.poses[keyframes[id].frame_index].world_from_camera;
+    let frame = |id: usize| keyframes.iter().find(|k| k.id == id).expect("both are of one submap").frame_index;
+    let true_pose = |id: usize| truth.poses[frame(id)].world_from_camera;
     let is_wrong = |l: &&ClosedLoop| {
         let error = l.keyframe_from_place.inverse() * true_pose(l.keyframe).inverse() * true_pose(l.place);
         error.translation.vector.norm() > world.loop_tolerance_metres()

@@ -120,7 +120,7 @@ fn replay(args: &WalkArgs, seed: u64, bar: &indicatif::ProgressBar) -> miette::R
             (part.longest_ms, part.longest_stage) = (ms, longest_stage(&tracked.times));
         }
         (part.keyframes, part.living) = (tracker.keyframe_count(), tracker.living_keyframes());
-        if i % 100 == 0 {
+        if i % 100 == 0 || (i + 1) * PARTS / frames != i * PARTS / frames {
             part.memory = memory();
             bar.set_position(seed * frames as u64 + i as u64);
         }

@@ -37,7 +37,7 @@ pub(super) struct CameraFile {
     pinhole: Pinhole,
     #[serde(default)]
     distortion: Distortion,
-    depth_units_per_metre: Option<f64>,
+    pub depth_units_per_metre: Option<f64>,
     #[serde(default = "usual_fps")]
     pub fps: f64,
     pub stereo: Option<StereoTable>,

@@ -12,6 +12,8 @@ use crate::sequence::{FrameEntry, Sensor, Sequence, SequenceError, cameras, fold
 
 /// Colour and depth further apart than this do not belong together (half a frame at 30 Hz, rounded up as the benchmark's tools do).
 const MAX_TIME_DIFFERENCE_S: f64 = 0.02;
+/// Of the benchmark's own depth images.
+const DEPTH_UNITS_PER_METRE: f64 = 5000.0;
 
 struct ListedImage {
     timestamp_s: f64,
@@ -40,7 +42,10 @@ fn open(folder: &Path, camera: Option<&str>) -> Result<Sequence, SequenceError> 
             let first = colors.first().ok_or_else(|| SequenceError::Empty { path: folder.join("rgb.txt") })?;
             cameras::assumed_for(&first.path)?
         }
-        Some(file) if cameras::is_file(file) => images::parse_camera(&read_text(Path::new(file))?, Path::new(file))?.0,
+        Some(file) if cameras::is_file(file) => {
+            let (camera, parsed) = images::parse_camera(&read_text(Path::new(file))?, Path::new(file))?;
+            Camera { depth_units_per_metre: parsed.depth_units_per_metre.unwrap_or(DEPTH_UNITS_PER_METRE), ..camera }
+        }
         Some(preset) => cameras::by_name(preset)?,
         None if folder.join("camera.txt").is_file() => {
             let path = folder.join("camera.txt");

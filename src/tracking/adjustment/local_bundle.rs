@@ -46,8 +46,14 @@ impl Adjustment {
     /// Global bundle adjustment of the submap that begins with `root`; `None` if it is too large for one adjustment.
     pub fn of_all(map: &Map, root: usize, config: &TrackingConfig) -> Option<Self> {
         let free: Vec<usize> = map.living_in(root).filter(|k| *k != root).collect();
-        let observations = free.iter().map(|k| map.keyframes[*k].landmarks.iter().flatten().count()).sum::<usize>();
-        if observations > MOST_OBSERVATIONS { None } else { Self::new(map, &free, &[root], config) }
+        let mut observations = 0;
+        for keyframe in &free {
+            observations += map.keyframes[*keyframe].landmarks.iter().flatten().count();
+            if observations > MOST_OBSERVATIONS {
+                return None;
+            }
+        }
+        Self::new(map, &free, &[root], config)
     }
 
     /// Bundle adjustment of the keyframes `free` and all their landmarks, with `fixed` held constant.

@@ -1,3 +1,3 @@
-//! Local and global bundle adjustment of the map, in a thread of its own.
+//! Local and global bundle adjustment of the map.
 
 pub mod local_bundle;

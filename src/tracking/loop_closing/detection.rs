@@ -44,6 +44,8 @@ const MAX_DRIFT_SHARE: f64 = 0.15;
 const DRIFT_METRES: f64 = 0.1;
 const DRIFT_RAD: f64 = 0.1;
 const MAX_SCALE_DRIFT: f64 = 2.0;
+/// A correction so many times as large as drift can explain is of another place.
+const REPETITION: f64 = 2.0;
 
 /// A place that was recognised and made sure of.
 #[derive(Clone, Debug)]
@@ -191,20 +193,24 @@ impl Search<'_> {
         Seen { camera_from_world: estimate.camera_from_world, matches, expected: visible.len() }
     }
 
-    /// Whether drift on the way from the place to the keyframe can explain the correction. Nothing is known of the way between submaps.
-    pub fn is_plausible(&self, found: &Recognised) -> bool {
+    /// How drift on the way from the place to the keyframe explains the correction. Nothing is known of the way between submaps.
+    pub fn plausibility(&self, found: &Recognised) -> Plausibility {
         let Recognised { keyframe, place, corrected, .. } = found;
         if !self.map.connects(*keyframe, *place) {
-            return true;
+            return Plausibility::Drift;
         }
         let (here, there) = (&self.map.keyframes[*keyframe], &self.map.keyframes[*place]);
         let path_metres = (here.travelled.metres - there.travelled.metres).abs();
         let rotation_rad = (here.travelled.radians - there.travelled.radians).abs();
         let off = corrected.to_rigid().inverse() * here.camera_from_world;
         let grown = corrected.scale.max(1.0 / corrected.scale);
-        self.shift_metres(found) <= DRIFT_METRES + MAX_DRIFT_SHARE * path_metres
-            && off.rotation.angle() <= DRIFT_RAD + MAX_DRIFT_SHARE * rotation_rad
-            && grown <= MAX_SCALE_DRIFT
+        let most_metres = DRIFT_METRES + MAX_DRIFT_SHARE * path_metres;
+        let turns_and_grows = off.rotation.angle() <= DRIFT_RAD + MAX_DRIFT_SHARE * rotation_rad && grown <= MAX_SCALE_DRIFT;
+        match self.shift_metres(found) / most_metres {
+            share if share <= 1.0 && turns_and_grows => Plausibility::Drift,
+            share if share > REPETITION && turns_and_grows => Plausibility::Repetition,
+            _ => Plausibility::None,
+        }
     }
 
     /// How far the correction moves the keyframe, metres.
@@ -212,6 +218,16 @@ impl Search<'_> {
         let corrected = Point3::from(found.corrected.to_rigid().inverse().translation.vector);
         (self.map.keyframes[found.keyframe].centre() - corrected).norm()
     }
+}
+
+/// What can explain a recognised place.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Plausibility {
+    /// The camera is back, and its pose has drifted.
+    Drift,
+    /// Another place looks like it, further away than drift can lead.
+    Repetition,
+    None,
 }
 
 /// Landmarks found in a keyframe.

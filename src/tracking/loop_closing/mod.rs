@@ -13,10 +13,12 @@ use crate::tracking::rig::Rig;
 use crate::tracking::solvers::pose_graph::Edge;
 use correction::loop_edge;
 pub use correction::{Correction, MovedKeyframe};
-use detection::{Search, knows_scale};
+use detection::{Plausibility, Search, knows_scale};
 
 /// Least keyframes between two closed loops.
 const REST: usize = 5;
+/// Loops that later corrections keep to, the newest; their keyframes are not culled.
+const MOST_EDGES: usize = 100;
 /// Where places repeat, a loop may correct less than this share of their distance: more may lead to the next that looks alike.
 const REPEAT_SHARE: f64 = 0.3;
 
@@ -38,14 +40,16 @@ pub struct LoopCloser {
     last: Option<usize>,
     /// How near to each other places were seen that look alike and cannot be the same.
     repeat_metres: f64,
-    /// Factors of all loops, and the keyframes at their ends.
+    /// Loops that later corrections do not keep to any more.
+    settled: Vec<ClosedLoop>,
+    /// Factors of the other loops, and the keyframes at their ends.
     edges: Vec<Edge>,
     ends: BTreeSet<usize>,
 }
 
 impl Default for LoopCloser {
     fn default() -> Self {
-        Self { last: None, repeat_metres: f64::INFINITY, edges: Vec::new(), ends: BTreeSet::new() }
+        Self { last: None, repeat_metres: f64::INFINITY, settled: Vec::new(), edges: Vec::new(), ends: BTreeSet::new() }
     }
 }
 
@@ -63,9 +67,14 @@ impl LoopCloser {
         for found in places.filter_map(|place| search.recognise(keyframe, place)) {
             let in_one_submap = map.connects(keyframe, found.place);
             let shift_metres = search.shift_metres(&found);
-            if !search.is_plausible(&found) {
+            let plausibility = search.plausibility(&found);
+            if plausibility == Plausibility::Repetition {
                 self.repeat_metres = self.repeat_metres.min(shift_metres);
-            } else if in_one_submap && (rests || shift_metres > REPEAT_SHARE * self.repeat_metres) {
+            }
+            if plausibility != Plausibility::Drift {
+                continue;
+            }
+            if in_one_submap && (rests || shift_metres > REPEAT_SHARE * self.repeat_metres) {
                 tracing::debug!(keyframe, place = found.place, shift_metres, "a place that may be another one like it");
             } else {
                 recognised = Some(found);
@@ -76,7 +85,11 @@ impl LoopCloser {
         let scale_is_free = search.scale_is_free;
         self.last = Some(keyframe);
         self.edges.push(loop_edge(map, &recognised));
-        self.ends.extend([keyframe, recognised.place]);
+        if self.edges.len() > MOST_EDGES {
+            // What it joined, common landmarks hold together.
+            self.settled.push(closed_loop(&self.edges.remove(0)));
+        }
+        self.ends = self.edges.iter().flat_map(|e| [e.a, e.b]).collect();
         let in_one_submap = map.connects(keyframe, recognised.place);
         let kind = if in_one_submap { "loop closed" } else { "submaps joined" };
         tracing::info!(keyframe, place = recognised.place, landmarks = recognised.matches.len(), "{kind}");
@@ -93,12 +106,15 @@ impl LoopCloser {
 
     /// All loops, in the order in which they were closed.
     pub fn loops(&self) -> Vec<ClosedLoop> {
-        let of = |e: &Edge| ClosedLoop { keyframe: e.a, place: e.b, keyframe_from_place: e.a_from_b.to_rigid() };
-        self.edges.iter().map(of).collect()
+        self.settled.iter().copied().chain(self.edges.iter().map(closed_loop)).collect()
     }
 
     /// Whether a loop begins or ends at a keyframe.
     pub fn holds(&self, keyframe: usize) -> bool {
         self.ends.contains(&keyframe)
     }
+}
+
+fn closed_loop(edge: &Edge) -> ClosedLoop {
+    ClosedLoop { keyframe: edge.a, place: edge.b, keyframe_from_place: edge.a_from_b.to_rigid() }
 }

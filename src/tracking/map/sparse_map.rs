@@ -283,6 +283,7 @@ impl Map {
     /// Gives up a keyframe, which has no landmarks any more: it and what it carries is attached to another one.
     pub fn attach(&mut self, keyframe: usize, parent: usize) {
         let features = std::mem::take(&mut self.keyframes[keyframe].features);
+        self.keyframes[keyframe].links = Vec::new();
         self.database.remove(keyframe, &features.features);
         self.living.remove(&keyframe);
         self.features -= features.len();

@@ -99,7 +99,7 @@ impl LensProblem {
     }
 
     /// Robust cost; infinite if a point lies behind a camera that sees it.
-    pub fn cost(&self) -> f64 {
+    fn cost(&self) -> f64 {
         let of = |o: &PixelObservation| self.residual(o).map_or(f64::INFINITY, |r| huber(r.norm_squared()).0);
         self.observations.iter().map(of).sum()
     }
@@ -109,6 +109,12 @@ impl LensProblem {
         let squared = self.observations.iter().filter_map(|o| Some(self.residual(o)?.norm_squared()));
         let inliers: Vec<f64> = squared.filter(|s| *s < CHI2_PIXEL).collect();
         ((inliers.iter().sum::<f64>() / (2.0 * inliers.len().max(1) as f64)).sqrt(), inliers.len())
+    }
+
+    /// Leaves out observations of points that lie behind their cameras.
+    pub fn drop_hidden(&mut self) {
+        let seen: Vec<PixelObservation> = self.observations.iter().filter(|o| self.residual(o).is_some()).copied().collect();
+        self.observations = seen;
     }
 
     /// Leaves out observations that disagree, and points that fewer than two others see then.
@@ -233,8 +239,7 @@ impl LensProblem {
     fn deviation(&self) -> Option<LensDeviation> {
         let Reduced { mut hessian, .. } = self.reduce(0.0);
         // The scale is free: held by little, it says nothing of the lens.
-        let least = 1e-6 * hessian.diagonal().max();
-        (0..hessian.nrows()).for_each(|i| hessian[(i, i)] += least.min(1e-6 * hessian[(i, i)]));
+        (0..hessian.nrows()).for_each(|i| hessian[(i, i)] *= 1.0 + 1e-6);
         let unknowns = hessian.nrows();
         let factor = hessian.cholesky()?;
         let variance = |i: usize| {
@@ -242,8 +247,11 @@ impl LensProblem {
             unit[i] = 1.0;
             factor.solve(&unit)[i]
         };
-        let (rms, _) = self.agreement();
-        let [focal, k1] = [unknowns - 2, unknowns - 1].map(|i| rms * variance(i).sqrt());
+        let (rms, inliers) = self.agreement();
+        let points = self.observations.chunk_by(|a, b| a.point == b.point).count();
+        let redundancy = (2 * inliers).checked_sub(3 * points + unknowns).filter(|n| *n > 0)?;
+        let sigma = rms * (2.0 * inliers as f64 / redundancy as f64).sqrt();
+        let [focal, k1] = [unknowns - 2, unknowns - 1].map(|i| sigma * variance(i).sqrt());
         (focal.is_finite() && k1.is_finite()).then_some(LensDeviation { focal, k1 })
     }
 }

@@ -165,16 +165,21 @@ impl Tracker {
     fn close_loops_and_cull(&mut self, keyframe: usize, times: &mut StageTimes) -> Result<(), TrackingError> {
         self.refresh_links(keyframe);
         let mut closed = false;
-        for keyframe in std::mem::take(&mut self.adjusting.overtaken).into_iter().chain([keyframe]) {
-            closed = closed || self.look_for_loop(keyframe, times)?;
+        let mut keyframes = std::mem::take(&mut self.adjusting.overtaken);
+        keyframes.push(keyframe);
+        for keyframe in &keyframes {
+            closed = closed || self.look_for_loop(*keyframe, times)?;
         }
         let clock = Instant::now();
         if !closed && self.rig.config.keyframe_culling {
             cull_around(&mut self.map, keyframe, |k| self.loops.holds(k), &self.rig.config);
+        }
+        // One more than there are new ones, so that the map gets below its bound.
+        for _ in 0..=keyframes.len() {
             let most = self.rig.config.max_host_bytes;
             self.adjusting.thinned = thin(&mut self.map, most, self.adjusting.thinned, |k| self.loops.holds(k), &self.rig.config);
-            self.motion.reference = self.map.living(self.motion.reference);
         }
+        self.motion.reference = self.map.living(self.motion.reference);
         times.mapping_ms += milliseconds(clock);
         Ok(())
     }
