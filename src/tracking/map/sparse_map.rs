@@ -3,7 +3,7 @@
 //! Everything is indexed by its place in a `Vec`, so every walk has one order. The place of a landmark that ended is used again when no frame can name
 //! it any more; who names landmarks for longer checks by which keyframe they were made. A culled keyframe
 //! keeps its place and its pose, and nothing else. No walk but a correction's is over all of them: what a frame or a keyframe costs depends on what
-//! it sees.
+//! it sees, and on the culled keyframes that follow those it moves.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
