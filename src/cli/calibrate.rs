@@ -70,27 +70,21 @@ pub fn find_camera(
     let config = TrackingConfig::default();
     let front_end = FrontEnd::new(Camera::assumed(width, height), sequence.sensor, &config);
     let bar = progress::bar(verbosity, (end - start) as u64, "{wide_bar} {pos}/{len} frames read");
-    let (frames, failed) = std::thread::scope(|scope| {
-        let read = scope.spawn(|| {
-            let (mut frames, mut failed) = (Vec::new(), None);
-            sequence.read_ahead(
-                start..end,
-                AHEAD,
-                |frame| front_end.extract(&frame),
-                |_, loaded| {
-                    bar.inc(1);
-                    match loaded {
-                        Ok(Ok(extracted)) => frames.push(extracted),
-                        Ok(Err(error)) => failed = Some(error),
-                        Err(error) => tracing::warn!("skipped, it cannot be read: {error}"),
-                    }
-                    failed.is_none()
-                },
-            );
-            (frames, failed)
-        });
-        read.join().unwrap_or_else(|payload| std::panic::resume_unwind(payload))
-    });
+    let (mut frames, mut failed) = (Vec::new(), None);
+    sequence.read_ahead(
+        start..end,
+        AHEAD,
+        |frame| front_end.extract(&frame),
+        |_, loaded| {
+            bar.inc(1);
+            match loaded {
+                Ok(Ok(extracted)) => frames.push(extracted),
+                Ok(Err(error)) => failed = Some(error),
+                Err(error) => tracing::warn!("skipped, it cannot be read: {error}"),
+            }
+            failed.is_none()
+        },
+    );
     bar.finish_and_clear();
     failed.map_or(Ok(()), Err).into_diagnostic()?;
     let found = self_calibrate(&frames, (width, height), &config).into_diagnostic()?;

@@ -2,7 +2,7 @@
 
 use keysplat::evaluation::{Alignment, evaluate_trajectory};
 use keysplat::geometry::{StampedPose, Trajectory};
-use keysplat::tracking::{ClosedLoop, Tracker, TrackingConfig};
+use keysplat::tracking::{Tracker, TrackingConfig};
 use keysplat::verification::walk::{Walk, World};
 
 struct Walked {
@@ -22,14 +22,7 @@ fn walk(world: World, frames: usize, config: &TrackingConfig) -> Walked {
         tracker.track_extracted(&frame, true).unwrap();
     }
     tracker.finish().unwrap();
-    let keyframes = tracker.keyframes();
-    let frame = |id: usize| keyframes.iter().find(|k| k.id == id).expect("both are of one submap").frame_index;
-    let true_pose = |id: usize| truth.poses[frame(id)].world_from_camera;
-    let is_wrong = |l: &&ClosedLoop| {
-        let error = l.keyframe_from_place.inverse() * true_pose(l.keyframe).inverse() * true_pose(l.place);
-        error.translation.vector.norm() > world.loop_tolerance_metres()
-    };
-    let wrong_loops = tracker.loops().iter().filter(is_wrong).count();
+    let wrong_loops = world.wrong_loops(&tracker, &truth);
     let poses: Vec<StampedPose> = tracker.trajectory().into_iter().map(|(_, pose)| pose).collect();
     let lost = frames - poses.len();
     let ate_rmse_m = evaluate_trajectory(&truth, &Trajectory { poses }, Alignment::Rigid).unwrap().ate_rmse_m;

@@ -7,8 +7,8 @@ use clap::Args;
 use keysplat::Config;
 use keysplat::evaluation::{Alignment, evaluate_trajectory};
 use keysplat::files::write_atomically;
-use keysplat::geometry::{Se3, StampedPose, Trajectory};
-use keysplat::tracking::{ClosedLoop, StageTimes, Tracker};
+use keysplat::geometry::{StampedPose, Trajectory};
+use keysplat::tracking::{StageTimes, Tracker};
 use keysplat::verification::walk::{Walk, World};
 use miette::IntoDiagnostic;
 
@@ -126,18 +126,10 @@ fn replay(args: &WalkArgs, seed: u64, bar: &indicatif::ProgressBar) -> miette::R
         }
     }
     tracker.finish().into_diagnostic()?;
-    let keyframes = tracker.keyframes();
-    let true_pose = |id: usize| Some(truth.poses[keyframes.iter().find(|k| k.id == id)?.frame_index].world_from_camera);
-    let loops = tracker.loops();
-    let is_wrong = |l: &&ClosedLoop| {
-        let Some((keyframe, place)) = true_pose(l.keyframe).zip(true_pose(l.place)) else { return false };
-        let error: Se3 = l.keyframe_from_place.inverse() * keyframe.inverse() * place;
-        error.translation.vector.norm() > args.world.loop_tolerance_metres()
-    };
-    let wrong_loops = loops.iter().filter(is_wrong).count();
+    let (loops, wrong_loops) = (tracker.loops().len(), args.world.wrong_loops(&tracker, &truth));
     let poses = tracker.trajectory().into_iter().map(|(_, pose)| pose).collect();
     let errors = evaluate_trajectory(&truth, &Trajectory { poses }, Alignment::Rigid);
-    Ok(Outcome { parts, loops: loops.len(), wrong_loops, ate_rmse_m: errors.ok().map(|e| e.ate_rmse_m) })
+    Ok(Outcome { parts, loops, wrong_loops, ate_rmse_m: errors.ok().map(|e| e.ate_rmse_m) })
 }
 
 fn longest_stage(times: &StageTimes) -> &'static str {

@@ -4,6 +4,7 @@
 //! As with bundle adjustment, deterministic replay takes a result in at a fixed frame, the later the larger it is, and real time when it is ready.
 
 use std::collections::VecDeque;
+use std::time::Instant;
 
 use super::{Tracker, milliseconds};
 use crate::geometry::Pinhole;
@@ -11,7 +12,6 @@ use crate::tracking::adjustment::local_bundle::Adjustment;
 use crate::tracking::loop_closing::{Correction, MovedKeyframe};
 use crate::tracking::worker::Worker;
 use crate::tracking::{StageTimes, TrackingError};
-use std::time::Instant;
 
 /// Deterministic replay: keyframes of a correction, and observations of an adjustment, that the thread has to itself a frame for.
 const KEYFRAMES_A_FRAME: usize = 8;

@@ -7,16 +7,17 @@
 mod path;
 mod world;
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use clap::ValueEnum;
 use nalgebra::{Point3, Vector2};
 
-use crate::geometry::{Camera, Distortion, Pinhole, Se3};
+use crate::geometry::{Camera, Distortion, Pinhole, Se3, Trajectory};
 use crate::sequence::Sensor;
 use crate::tracking::features::descriptor::Descriptor;
 use crate::tracking::features::frame_features::{Feature, FrameFeatures};
-use crate::tracking::{ExtractedFrame, TrackingConfig};
+use crate::tracking::{ClosedLoop, ExtractedFrame, Tracker, TrackingConfig};
 use path::Path;
 use world::{Halls, SeenPoint};
 
@@ -34,6 +35,8 @@ const FALSE_DEPTHS: f64 = 0.02;
 const PIXEL_SIGMA: f64 = 0.6;
 const DISPARITY_SIGMA: f64 = 0.5;
 const BASELINE_METRES: f64 = 0.54;
+/// Error of a loop's relative pose from which on the loop is wrong, as a share of a hall's length.
+const WRONG_SHARE: f64 = 0.1;
 
 /// A simulated world, and who walks through it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -94,9 +97,17 @@ impl World {
         }
     }
 
-    /// Error of a loop's relative pose from which on the loop is wrong.
-    pub fn loop_tolerance_metres(self) -> f64 {
-        0.1 * self.scale().edge
+    /// How many loops of a walk are wrong: their relative pose is off by more than a tenth of a hall. `truth` has a pose for each frame.
+    pub fn wrong_loops(self, tracker: &Tracker, truth: &Trajectory) -> usize {
+        let frames: BTreeMap<usize, usize> = tracker.keyframes().iter().map(|k| (k.id, k.frame_index)).collect();
+        let true_pose = |id: usize| Some(truth.poses[*frames.get(&id)?].world_from_camera);
+        let is_wrong = |l: &&ClosedLoop| {
+            // Keyframes of submaps that never joined are left out.
+            let Some((keyframe, place)) = true_pose(l.keyframe).zip(true_pose(l.place)) else { return false };
+            let error = l.keyframe_from_place.inverse() * keyframe.inverse() * place;
+            error.translation.vector.norm() > WRONG_SHARE * self.scale().edge
+        };
+        tracker.loops().iter().filter(is_wrong).count()
     }
 
     /// What its frames come from.
@@ -219,8 +230,7 @@ impl Walk {
 mod tests {
     use super::*;
     use crate::evaluation::{Alignment, evaluate_trajectory};
-    use crate::geometry::{StampedPose, Trajectory};
-    use crate::tracking::Tracker;
+    use crate::geometry::StampedPose;
 
     #[test]
     fn a_walk_is_smooth_and_the_same_each_time() {
