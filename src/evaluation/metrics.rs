@@ -7,6 +7,7 @@ use std::fmt;
 use std::path::Path;
 
 use crate::sequence::SensorKind;
+use crate::tracking::DepthBias;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
@@ -55,6 +56,9 @@ pub struct Metrics {
     pub resumed: u64,
     /// Tracking time of a frame, milliseconds.
     pub tracking_ms: Option<Times>,
+    /// Systematic error of the depth images that the tracker found.
+    #[serde(default)]
+    pub depth_bias: Option<DepthBiasFigures>,
     /// Figures of the optimisation.
     pub mapping: Option<MappingFigures>,
     /// Peak resident memory of the process, bytes.
@@ -71,6 +75,26 @@ pub struct Metrics {
     pub version: String,
     /// SHA-256 of the resolved configuration's text.
     pub config_hash: Option<String>,
+}
+
+/// Measured inverse depth minus the true one, 1/metres: offset + tilt_x · x + tilt_y · y, with x to the right and y down from the principal
+/// point in half image widths.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DepthBiasFigures {
+    /// At the principal point.
+    pub offset_per_m: f64,
+    /// Along the image's rows.
+    pub tilt_x_per_m: f64,
+    /// Along its columns.
+    pub tilt_y_per_m: f64,
+}
+
+impl DepthBiasFigures {
+    /// The figures of a tracker's estimate.
+    pub fn of(DepthBias(bias): DepthBias) -> Self {
+        Self { offset_per_m: bias.x, tilt_x_per_m: bias.y, tilt_y_per_m: bias.z }
+    }
 }
 
 /// Absolute trajectory error, each aligned over its own poses.

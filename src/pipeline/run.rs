@@ -118,6 +118,7 @@ fn gather(
         frames_read_failed: read.read_failed,
         frames_late: read.late,
         keyframes_deferred: track.deferred,
+        depth_bias: track.depth_bias,
         step_ms: map.step_ms,
         wall_s,
         resumed,

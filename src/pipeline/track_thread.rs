@@ -12,7 +12,7 @@ use crate::mapping::{DepthSource, Keyframe, KeyframeId, MapperMessage, PoseUpdat
 use crate::recording::Recording;
 use crate::run_folder::FrameRecord;
 use crate::sequence::{Frame, Rectifier, Sensor};
-use crate::tracking::{KeyframePose, KeyframeUpdate, NewKeyframe, TrackedFrame, Tracker, TrackingState};
+use crate::tracking::{DepthBias, KeyframePose, KeyframeUpdate, NewKeyframe, TrackedFrame, Tracker, TrackingState};
 
 /// Result of the tracking thread, also when it ended early.
 #[derive(Debug, Default)]
@@ -23,6 +23,7 @@ pub(super) struct TrackSummary {
     pub frames: Vec<FrameRecord>,
     /// Real time: keyframes that the mapper never received.
     pub deferred: usize,
+    pub depth_bias: Option<DepthBias>,
     pub error: Option<PipelineError>,
 }
 
@@ -150,6 +151,7 @@ impl TrackThread<'_> {
         });
         summary.trajectory = tracker.trajectory();
         summary.keyframes = tracker.keyframes();
+        summary.depth_bias = tracker.depth_bias();
         let unjoined = tracker.unjoined_keyframes();
         if !unjoined.is_empty() {
             tracing::warn!(

@@ -8,7 +8,9 @@ use image::{GenericImage, RgbImage};
 use serde::Serialize;
 
 use super::{FolderLock, RunResult};
-use crate::evaluation::metrics::{Adapter, AteFigures, ImageProtocols, MappingFigures, Metrics, RpeFigures, Times, UsualTimes};
+use crate::evaluation::metrics::{
+    Adapter, AteFigures, DepthBiasFigures, ImageProtocols, MappingFigures, Metrics, RpeFigures, Times, UsualTimes,
+};
 use crate::evaluation::views::{ComparedView, ViewSelection, ViewSource, evaluate_views};
 use crate::evaluation::{
     Alignment, Comparison, Exposures, draw_trajectory, evaluate_trajectory, machine, sha256_hex, write_json,
@@ -350,6 +352,7 @@ pub fn write_metrics(
         wall_s: Some(result.wall_s),
         resumed: result.resumed,
         tracking_ms: Times::of(&result.tracking_ms),
+        depth_bias: result.depth_bias.map(DepthBiasFigures::of),
         mapping: Some(MappingFigures {
             iterations,
             iterations_per_frame: iterations as f64 / frames.max(1) as f64,

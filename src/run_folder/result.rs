@@ -7,7 +7,7 @@ use super::history::{History, KeyframeRecord};
 use crate::evaluation::{ExposureRecord, Exposures};
 use crate::geometry::{Se3, StampedPose, Trajectory};
 use crate::splat::GaussianCloud;
-use crate::tracking::KeyframePose;
+use crate::tracking::{DepthBias, KeyframePose};
 
 /// Trajectory, map and records of a run, whether or not it reached its end.
 #[derive(Clone, Debug, Default)]
@@ -28,6 +28,8 @@ pub struct RunResult {
     pub frames_late: usize,
     /// Real time: keyframes that the mapper never received.
     pub keyframes_deferred: usize,
+    /// Systematic error of the depth images, if it was estimated.
+    pub depth_bias: Option<DepthBias>,
     /// Tracking time of each frame, milliseconds.
     pub tracking_ms: Vec<f64>,
     /// Duration of each optimisation step, milliseconds.

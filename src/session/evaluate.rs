@@ -153,6 +153,7 @@ fn foreign_metrics(recording: &Recording) -> Metrics {
         wall_s: None,
         resumed: 0,
         tracking_ms: None,
+        depth_bias: None,
         mapping: None,
         peak_host_bytes: None,
         peak_gpu_bytes: None,

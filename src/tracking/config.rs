@@ -29,6 +29,8 @@ pub struct TrackingConfig {
     /// Standard deviation of measured inverse depth, 1/metres. A structured-light sensor measures disparity with constant noise,
     /// so its depth noise grows as `inverse_depth_sigma * depth²`.
     pub inverse_depth_sigma: f64,
+    /// Whether a systematic error of depth images is estimated: an offset and a tilt of inverse depth over the image.
+    pub depth_bias: bool,
     /// Standard deviation of a stereo disparity at the finest pyramid level, pixels. Coarser levels scale it.
     pub disparity_sigma: f64,
     /// A depth whose 3x3 neighbourhood spans more than this share of it lies on an edge and is dropped.
@@ -70,6 +72,7 @@ impl Default for TrackingConfig {
             max_depth_metres: 6.0,
             pixel_sigma: 1.0,
             inverse_depth_sigma: 0.025,
+            depth_bias: true,
             disparity_sigma: 1.4,
             depth_edge_ratio: 0.05,
             min_initial_landmarks: 50,

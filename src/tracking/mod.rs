@@ -28,6 +28,7 @@ pub use error::TrackingError;
 pub use front_end::{ExtractedFrame, FrontEnd};
 pub use loop_closing::ClosedLoop;
 pub use self_calibration::{SelfCalibration, SelfCalibrationError, self_calibrate};
+pub use solvers::depth_bias::DepthBias;
 pub use tracker::Tracker;
 
 use nalgebra::Vector2;

@@ -87,7 +87,7 @@ impl PosedView {
 /// The points that each view sees, in the order of its features.
 pub fn triangulate_views(views: &[PosedView], config: &TrackingConfig) -> Vec<Vec<SeenPoint>> {
     let Some(first) = views.first() else { return Vec::new() };
-    let rig = Rig { pinhole: first.pinhole, config: config.clone() };
+    let rig = Rig::new(first.pinhole, config.clone());
     let features: Vec<Vec<Feature>> = views.iter().map(|view| features_in(view, &rig.pinhole)).collect();
     let candidates: Vec<Candidates<'_>> = views.iter().zip(&features).map(|(view, features)| view.candidates(features)).collect();
     (0..views.len()).into_par_iter().map(|index| points_of(views, &candidates, index, &rig)).collect()

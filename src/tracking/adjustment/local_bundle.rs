@@ -12,6 +12,7 @@ use crate::tracking::TrackingConfig;
 use crate::tracking::map::sparse_map::{Map, Observation};
 use crate::tracking::rig::Rig;
 use crate::tracking::solvers::bundle::{BundleObservation, BundleProblem};
+use crate::tracking::solvers::depth_bias::{BiasPrior, DepthBias};
 use crate::tracking::solvers::residual::InlierClass;
 
 /// Keyframes that share fewer landmarks than this are not moved together.
@@ -38,13 +39,13 @@ pub struct Adjustment {
 
 impl Adjustment {
     /// Local bundle adjustment around `keyframe`; `None` if nothing in its window may move.
-    pub fn of_window(map: &Map, keyframe: usize, config: &TrackingConfig) -> Option<Self> {
-        let (free, fixed) = choose_window(map, keyframe, config);
-        Self::new(map, &free, &fixed, config)
+    pub fn of_window(map: &Map, keyframe: usize, rig: &Rig) -> Option<Self> {
+        let (free, fixed) = choose_window(map, keyframe, &rig.config);
+        Self::new(map, &free, &fixed, rig)
     }
 
     /// Global bundle adjustment of the submap that begins with `root`; `None` if it is too large for one adjustment.
-    pub fn of_all(map: &Map, root: usize, config: &TrackingConfig) -> Option<Self> {
+    pub fn of_all(map: &Map, root: usize, rig: &Rig) -> Option<Self> {
         let free: Vec<usize> = map.living_in(root).filter(|k| *k != root).collect();
         let mut observations = 0;
         for keyframe in &free {
@@ -53,19 +54,31 @@ impl Adjustment {
                 return None;
             }
         }
-        Self::new(map, &free, &[root], config)
+        Self::new(map, &free, &[root], rig)
     }
 
     /// Bundle adjustment of the keyframes `free` and all their landmarks, with `fixed` held constant.
-    fn new(map: &Map, free: &[usize], fixed: &[usize], config: &TrackingConfig) -> Option<Self> {
-        if free.is_empty() || config.bundle_iterations == 0 {
+    fn new(map: &Map, free: &[usize], fixed: &[usize], rig: &Rig) -> Option<Self> {
+        if free.is_empty() || rig.config.bundle_iterations == 0 {
             return None;
         }
         let mut landmarks = map.landmarks_of(free);
         landmarks.retain(|l| map.landmarks[*l].observations.len() > 1);
         let keyframes: Vec<usize> = free.iter().chain(fixed).copied().collect();
-        let (problem, observations) = make_problem(map, &keyframes, free.len(), &landmarks, config);
+        let (problem, observations) = make_problem(map, &keyframes, free.len(), &landmarks, rig);
         Some(Self { problem, keyframes, landmarks, observations, known: map.keyframes.len(), corrections: map.corrections })
+    }
+
+    /// With the bias of a depth sensor among the unknowns, near what it was found to be before.
+    #[must_use]
+    pub fn with_bias(mut self, rig: &Rig) -> Self {
+        self.problem.bias_prior = Some(BiasPrior::after(&rig.depth_bias, rig.config.inverse_depth_sigma));
+        self
+    }
+
+    /// The bias that it found, if that was sought.
+    pub fn bias(&self) -> Option<DepthBias> {
+        self.problem.bias_prior.map(|_| self.problem.depth_bias)
     }
 
     /// Moves poses and points to where they agree best, twice: outliers are found by the first round and left out of the second.
@@ -124,8 +137,8 @@ impl Adjustment {
 
 /// Adjusts the window around `keyframe` at once.
 pub fn adjust_window(map: &mut Map, keyframe: usize, rig: &Rig) {
-    let Rig { pinhole, config } = rig;
-    if let Some(mut window) = Adjustment::of_window(map, keyframe, config) {
+    let Rig { pinhole, config, .. } = rig;
+    if let Some(mut window) = Adjustment::of_window(map, keyframe, rig) {
         window.solve(pinhole, config.bundle_iterations);
         window.apply(map, config);
     }
@@ -153,20 +166,21 @@ fn make_problem(
     keyframes: &[usize],
     free_poses: usize,
     landmarks: &[usize],
-    config: &TrackingConfig,
+    rig: &Rig,
 ) -> (BundleProblem, Vec<Observation>) {
     let place: BTreeMap<usize, usize> = keyframes.iter().enumerate().map(|(i, k)| (*k, i)).collect();
     let mut problem = BundleProblem {
         poses: keyframes.iter().map(|k| map.keyframes[*k].camera_from_world).collect(),
         free_poses,
         points: landmarks.iter().map(|l| map.position(*l)).collect(),
+        depth_bias: rig.depth_bias,
         ..Default::default()
     };
     let mut observations = Vec::new();
     for (point, l) in landmarks.iter().enumerate() {
         for observation in &map.landmarks[*l].observations {
             let Some(&pose) = place.get(&observation.keyframe) else { continue };
-            let measurement = map.keyframes[observation.keyframe].features.features[observation.feature].measurement(config);
+            let measurement = map.keyframes[observation.keyframe].features.features[observation.feature].measurement(&rig.config);
             let class = if measurement.inverse_depth.is_some() { InlierClass::Full } else { InlierClass::PixelOnly };
             problem.observations.push(BundleObservation { pose, point, measurement, class });
             observations.push(*observation);
@@ -181,6 +195,7 @@ mod tests {
     use crate::geometry::{Sim3, se3};
     use crate::tracking::loop_closing::tests::drifted;
     use crate::tracking::map::sparse_map::{Keyframe, LandmarkState};
+    use crate::tracking::solvers::residual::tests::PINHOLE;
     use nalgebra::{Point3, Vector6};
 
     #[test]
@@ -188,7 +203,7 @@ mod tests {
         let config = TrackingConfig::default();
         let mut map = drifted(&Sim3::identity(), true, &config);
         let last = map.keyframes.len() - 1;
-        let mut window = Adjustment::of_window(&map, last, &config).unwrap();
+        let mut window = Adjustment::of_window(&map, last, &Rig::new(PINHOLE, config.clone())).unwrap();
         let gone = window.landmarks[3];
         map.remove_landmark(gone);
         window.problem.observations.iter_mut().filter(|o| o.point == 3).for_each(|o| o.class = InlierClass::Outlier);

@@ -5,6 +5,7 @@ use nalgebra::{Point3, Vector2};
 use crate::geometry::Pinhole;
 use crate::tracking::TrackingConfig;
 use crate::tracking::features::descriptor::Descriptor;
+use crate::tracking::rig::Rig;
 use crate::tracking::solvers::residual::Measurement;
 
 /// Side of the search grid's cells, pixels.
@@ -75,10 +76,11 @@ impl FrameFeatures {
     }
 
     /// The feature's point in the camera frame; `None` without a depth that is certain enough to make a point of.
-    pub fn point_in_camera(&self, index: usize, pinhole: &Pinhole) -> Option<Point3<f64>> {
+    pub fn point_in_camera(&self, index: usize, rig: &Rig) -> Option<Point3<f64>> {
         let feature = &self.features[index];
-        let depth = feature.depth_metres.filter(|depth| depth * feature.inverse_depth_sigma < MAX_DEPTH_ERROR)?;
-        Some(Point3::from(pinhole.unproject(&feature.pixel, depth)))
+        let inverse_depth = rig.measurement(feature).inverse_depth?;
+        let certain = inverse_depth * MAX_DEPTH_ERROR > feature.inverse_depth_sigma;
+        certain.then(|| Point3::from(rig.pinhole.unproject(&feature.pixel, 1.0 / inverse_depth)))
     }
 
     /// Median of the measured depths, metres.

@@ -69,7 +69,7 @@ pub struct SecondView<'a> {
 
 /// The map of two keyframes, if the first view and this frame show one scene from two places.
 pub fn first_map(first: &FirstView, second: &SecondView<'_>, matches: &[Match], rig: &Rig) -> Option<Map> {
-    let Rig { pinhole, config } = rig;
+    let Rig { pinhole, config, .. } = rig;
     let SecondView { frame_index, timestamp_s, features } = *second;
     let pixels: Vec<(Vector2<f64>, Vector2<f64>)> =
         matches.iter().map(|m| (first.features.features[m.query].pixel, features.features[m.feature].pixel)).collect();

@@ -114,7 +114,7 @@ impl Context<'_> {
     /// The last frame as a view: its landmarks, and temporary points from depth for its other features.
     pub fn view_of_last(&self, last: &LastFrame) -> View {
         let world_from_camera = last.camera_from_world.inverse();
-        let temporary = |i| last.features.point_in_camera(i, &self.rig.pinhole).map(|p| world_from_camera * p);
+        let temporary = |i| last.features.point_in_camera(i, self.rig).map(|p| world_from_camera * p);
         let point = |i: usize| last.landmarks[i].map(|l| self.map.position(l)).or_else(|| temporary(i));
         View {
             features: last.features.clone(),
@@ -182,8 +182,7 @@ impl Context<'_> {
         for (feature, landmark) in landmarks.iter_mut().enumerate() {
             let agrees = |l: &usize| {
                 let p_in_camera = (camera_from_world * self.map.position(*l)).coords;
-                frame.features[feature].measurement(&self.rig.config).classify(&self.rig.pinhole, &p_in_camera)
-                    != InlierClass::Outlier
+                self.rig.measurement(&frame.features[feature]).classify(&self.rig.pinhole, &p_in_camera) != InlierClass::Outlier
             };
             *landmark = landmark.filter(agrees);
         }
@@ -204,7 +203,7 @@ impl Context<'_> {
         let usable: Vec<(usize, usize, PoseObservation)> = pairs
             .iter()
             .filter_map(|(source, feature)| {
-                let measurement = frame.features[*feature].measurement(&self.rig.config);
+                let measurement = self.rig.measurement(&frame.features[*feature]);
                 known(*source).map(|point_in_world| (*source, *feature, PoseObservation { point_in_world, measurement }))
             })
             .collect();

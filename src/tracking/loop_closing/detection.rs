@@ -156,7 +156,7 @@ impl Search<'_> {
     /// The point that a feature shows: its landmark, or where its depth was measured.
     fn point_in_camera(&self, keyframe: &Keyframe, feature: usize) -> Option<Point3<f64>> {
         let landmark = keyframe.landmarks[feature].map(|l| keyframe.camera_from_world * self.map.position(l));
-        landmark.or_else(|| keyframe.features.point_in_camera(feature, &self.rig.pinhole))
+        landmark.or_else(|| keyframe.features.point_in_camera(feature, self.rig))
     }
 
     /// keyframe_from_place, from features that match and whose points are known.
@@ -169,8 +169,8 @@ impl Search<'_> {
             Some(Pair {
                 p_in_a: points[i]?,
                 p_in_b: self.point_in_camera(b, j)?,
-                in_a: a.features.features[i].measurement(&self.rig.config),
-                in_b: b.features.features[j].measurement(&self.rig.config),
+                in_a: self.rig.measurement(&a.features.features[i]),
+                in_b: self.rig.measurement(&b.features.features[j]),
             })
         };
         let pairs: Vec<Pair> = matches.iter().filter_map(|m| pair((m.query, m.feature))).collect();
@@ -184,7 +184,7 @@ impl Search<'_> {
         let found = PROJECTION_SEARCH.run(features, &visible, |_| PROJECTION_RADIUS, self.rig);
         let observation = |m: &PointMatch| PoseObservation {
             point_in_world: self.map.position(m.point),
-            measurement: features.features[m.feature].measurement(&self.rig.config),
+            measurement: self.rig.measurement(&features.features[m.feature]),
         };
         let observations: Vec<PoseObservation> = found.iter().map(observation).collect();
         let estimate = optimise_pose(&self.rig.pinhole, camera_from_world, &observations);

@@ -84,7 +84,7 @@ pub(crate) fn drifted(step: &Sim3, with_depth: bool, config: &TrackingConfig) ->
 
 /// Closes a loop at once.
 fn close(closer: &mut LoopCloser, map: &mut Map, keyframe: usize, config: &TrackingConfig) -> Vec<MovedKeyframe> {
-    let rig = Rig { pinhole: PINHOLE, config: config.clone() };
+    let rig = Rig::new(PINHOLE, config.clone());
     let Some(mut correction) = closer.recognise(map, keyframe, &rig) else { return Vec::new() };
     correction.solve();
     closer.apply(&correction, map, &rig)
@@ -108,7 +108,7 @@ fn a_loop_is_closed_with_and_without_scale() {
         assert!(before > 0.1 && map.covisible(newest).iter().all(|(k, _)| *k > 20), "{before} m");
         let mut again = map.clone();
         let moved = close(&mut LoopCloser::default(), &mut map, newest, &config);
-        let mut all = Adjustment::of_all(&map, 0, &config).unwrap();
+        let mut all = Adjustment::of_all(&map, 0, &Rig::new(PINHOLE, config.clone())).unwrap();
         all.solve(&PINHOLE, config.bundle_iterations);
         all.apply(&mut map, &config);
         assert_eq!(moved.iter().map(|m| m.keyframe).collect::<Vec<_>>(), (1..=newest).collect::<Vec<_>>());
@@ -164,7 +164,7 @@ fn rotations_stay_rotations_through_any_number_of_corrections() {
     let config = TrackingConfig::default();
     let step = sim3::exp(&Vector7::from_column_slice(&[0.004, 0.001, -0.003, 0.001, 0.003, 0.0005, 0.0]));
     let mut map = drifted(&step, true, &config);
-    let (newest, rig) = (map.keyframes.len() - 1, Rig { pinhole: PINHOLE, config });
+    let (newest, rig) = (map.keyframes.len() - 1, Rig::new(PINHOLE, config));
     let mut closer = LoopCloser::default();
     let mut correction = closer.recognise(&mut map, newest, &rig).unwrap();
     correction.solve();

@@ -23,7 +23,7 @@ const MIN_OBSERVED_SHARE: f64 = 0.25;
 
 /// Puts a keyframe in the map with the landmarks that its frame was tracked by; makes new ones from depth. Returns its id.
 pub fn insert_keyframe(map: &mut Map, mut keyframe: Keyframe, rig: &Rig) -> usize {
-    let Rig { pinhole, config } = rig;
+    let config = &rig.config;
     let features = keyframe.features.clone();
     let tracked = std::mem::replace(&mut keyframe.landmarks, vec![None; features.len()]);
     let world_from_camera = keyframe.camera_from_world.inverse();
@@ -37,7 +37,7 @@ pub fn insert_keyframe(map: &mut Map, mut keyframe: Keyframe, rig: &Rig) -> usiz
     }
     for feature in 0..features.len() {
         let free = map.keyframes[id].landmarks[feature].is_none();
-        if let Some(p_in_camera) = features.point_in_camera(feature, pinhole).filter(|_| free) {
+        if let Some(p_in_camera) = features.point_in_camera(feature, rig).filter(|_| free) {
             map.add_landmark(Observation { keyframe: id, feature }, world_from_camera * p_in_camera, config);
         }
     }
@@ -57,7 +57,7 @@ pub fn fuse_with_neighbours(map: &mut Map, keyframe: usize, rig: &Rig) {
 
 /// Looks for `landmarks` in a keyframe: adds observations, and merges where the feature found shows another landmark.
 pub fn fuse(map: &mut Map, keyframe: usize, landmarks: &[usize], rig: &Rig) {
-    let Rig { pinhole, config } = rig;
+    let Rig { pinhole, config, .. } = rig;
     let target = &map.keyframes[keyframe];
     let unseen = |l: &usize| map.landmarks[*l].state == LandmarkState::Alive && !map.landmarks[*l].seen_by(keyframe);
     let visible = map.visible(landmarks.iter().copied().filter(unseen), &target.camera_from_world, rig);
@@ -65,7 +65,7 @@ pub fn fuse(map: &mut Map, keyframe: usize, landmarks: &[usize], rig: &Rig) {
     let mut changed = BTreeSet::new();
     for PointMatch { point: landmark, feature } in FUSE_SEARCH.run(&features, &visible, |_| FUSE_RADIUS, rig) {
         let p_in_camera = (map.keyframes[keyframe].camera_from_world * map.position(landmark)).coords;
-        if features.features[feature].measurement(config).classify(pinhole, &p_in_camera) == InlierClass::Outlier {
+        if rig.measurement(&features.features[feature]).classify(pinhole, &p_in_camera) == InlierClass::Outlier {
             continue;
         }
         match map.keyframes[keyframe].landmarks[feature] {

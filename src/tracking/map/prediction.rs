@@ -55,7 +55,7 @@ impl Map {
 
     /// Where a camera should see a landmark; `None` outside of its image, its range of distances or its viewing directions.
     fn predict(&self, landmark: usize, camera_from_world: &Se3, rig: &Rig) -> Option<Projection> {
-        let Rig { pinhole, config } = rig;
+        let Rig { pinhole, config, .. } = rig;
         let l = &self.landmarks[landmark];
         let anchor = &self.keyframes[l.anchor];
         let p_in_camera = (camera_from_world * self.position(landmark)).coords;
@@ -96,7 +96,7 @@ mod tests {
     fn a_landmark_is_predicted_where_and_how_large_it_was_seen() {
         let mut map = map();
         let id = map.add_landmark(at(0, 1), Point3::new(0.0, 0.0, 2.0), &config());
-        let predict = |pose: &Se3| map.predict(id, pose, &Rig { pinhole: PINHOLE, config: config() });
+        let predict = |pose: &Se3| map.predict(id, pose, &Rig::new(PINHOLE, config()));
         let here = predict(&Se3::identity()).unwrap();
         assert_eq!((here.octave, here.inverse_depth), (0, 0.5));
         assert!((here.pixel - Vector2::new(320.5, 241.0)).norm() < 1e-9);

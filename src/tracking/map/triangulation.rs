@@ -126,7 +126,7 @@ pub fn triangulate_with_neighbours(map: &mut Map, keyframe: usize, rig: &Rig) ->
 
 /// Pairs of the wanted features that show one point; each feature at most once.
 pub fn match_along_lines(this: &Candidates<'_>, other: &Candidates<'_>, rig: &Rig) -> Vec<MatchedPoint> {
-    let Rig { pinhole, config } = rig;
+    let Rig { pinhole, config, .. } = rig;
     let fundamental = fundamental(&(other.camera_from_world * this.camera_from_world.inverse()), pinhole);
     let mut taken: Vec<Option<(u32, MatchedPoint)>> = vec![None; other.features.len()];
     for &mine in &this.wanted {
@@ -137,7 +137,7 @@ pub fn match_along_lines(this: &Candidates<'_>, other: &Candidates<'_>, rig: &Ri
         let Some(met) = triangulate(&this.view(pinhole), &feature.pixel, &other.view(pinhole), &found.pixel) else { continue };
         let agrees = met.parallax_cosine < MAX_PARALLAX_COSINE && {
             let mine = Observed { feature, view: this.view(pinhole) };
-            agree(&met.point, &mine, &Observed { feature: found, view: other.view(pinhole) }, config)
+            agree(&met.point, &mine, &Observed { feature: found, view: other.view(pinhole) }, rig)
         };
         if agrees && taken[theirs].is_none_or(|(d, _)| distance < d) {
             let Triangulated { point, parallax_cosine } = met;
@@ -178,14 +178,12 @@ struct Observed<'a> {
 }
 
 /// Whether a point projects to both features, at distances that fit their sizes.
-fn agree(point: &Point3<f64>, a: &Observed<'_>, b: &Observed<'_>, config: &TrackingConfig) -> bool {
+fn agree(point: &Point3<f64>, a: &Observed<'_>, b: &Observed<'_>, rig: &Rig) -> bool {
     let projects = |Observed { feature, view }: &Observed<'_>| {
-        let class = feature.measurement(config).classify(view.pinhole, &(view.camera_from_world * point).coords);
+        let class = rig.measurement(feature).classify(view.pinhole, &(view.camera_from_world * point).coords);
         class == InlierClass::Full || (class == InlierClass::PixelOnly && feature.depth_metres.is_none())
     };
-    let size = |Observed { feature, view }: &Observed<'_>| {
-        (point - view.centre()).norm() / config.pyramid_scale.powi(feature.octave.into())
-    };
+    let size = |Observed { feature, view }: &Observed<'_>| (point - view.centre()).norm() / rig.octave_scale(feature.octave);
     let ratio = size(a) / size(b);
     projects(a) && projects(b) && ratio < SIZE_SLACK && ratio > 1.0 / SIZE_SLACK
 }

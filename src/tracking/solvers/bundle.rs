@@ -1,11 +1,13 @@
 //! Bundle adjustment: poses and points together, by Levenberg-Marquardt with the points eliminated by their Schur complement
-//! (Triggs et al., *Bundle adjustment: a modern synthesis*, 2000), Huber's kernel, and depth residuals.
+//! (Triggs et al., *Bundle adjustment: a modern synthesis*, 2000), Huber's kernel, and depth residuals. The bias of measured depth is one more block
+//! of unknowns beside the free poses.
 //!
 //! Knows nothing of the map; `window.rs` makes the problem and takes the result. Sums run in the order of the observations.
 
 use nalgebra::{Matrix3, Matrix6, Matrix6x3, Point3, Vector3, Vector6};
 
 use crate::geometry::{Pinhole, Se3, se3};
+use crate::tracking::solvers::depth_bias::{BiasPrior, DepthBias};
 use crate::tracking::solvers::residual::{InlierClass, Measurement, point_by_pose};
 use crate::tracking::solvers::schur::ReducedSystem;
 
@@ -34,22 +36,28 @@ pub struct BundleProblem {
     pub points: Vec<Point3<f64>>,
     /// Sorted by point.
     pub observations: Vec<BundleObservation>,
+    /// Of all measured depths.
+    pub depth_bias: DepthBias,
+    /// What is known of the bias beforehand. Without a prior the bias stays as it is.
+    pub bias_prior: Option<BiasPrior>,
 }
 
-/// An observation's share of the normal equations.
+/// What a block of six unknowns and a point have in common in the normal equations.
 struct Mixed {
-    observation: usize,
-    pose: usize,
-    pose_by_point: Matrix6x3<f64>,
+    point: usize,
+    block: usize,
+    block_by_point: Matrix6x3<f64>,
 }
 
-/// The normal equations, points grouped.
+/// The normal equations, points grouped. Blocks are those of the free poses, then the bias if it is sought.
 struct System {
-    hessian_poses: Vec<Matrix6<f64>>,
-    gradient_poses: Vec<Vector6<f64>>,
+    hessian_blocks: Vec<Matrix6<f64>>,
+    gradient_blocks: Vec<Vector6<f64>>,
+    /// Of the bias (rows) and each free pose (columns).
+    bias_by_pose: Vec<Matrix6<f64>>,
     hessian_points: Vec<Matrix3<f64>>,
     gradient_points: Vec<Vector3<f64>>,
-    /// Blocks of free poses, sorted by point.
+    /// Sorted by point.
     mixed: Vec<Mixed>,
 }
 
@@ -67,7 +75,7 @@ impl BundleProblem {
         let Some(reduced) = self.reduced_system() else { return (initial, initial) };
         for _ in 0..steps {
             let system = self.linearise(pinhole);
-            let before = (self.poses.clone(), self.points.clone());
+            let before = (self.poses.clone(), self.points.clone(), self.depth_bias);
             let mut lowered = None;
             while lambda < MAX_LAMBDA {
                 if self.step(&system, &reduced, lambda) {
@@ -77,7 +85,7 @@ impl BundleProblem {
                         break;
                     }
                 }
-                (self.poses, self.points) = before.clone();
+                (self.poses, self.points, self.depth_bias) = before.clone();
                 lambda *= 10.0;
             }
             let Some(candidate) = lowered else { break };
@@ -94,15 +102,18 @@ impl BundleProblem {
     /// Judges every observation anew by χ².
     pub fn classify(&mut self, pinhole: &Pinhole) {
         for o in &mut self.observations {
-            o.class = o.measurement.classify(pinhole, &(self.poses[o.pose] * self.points[o.point]).coords);
+            o.class = o
+                .measurement
+                .without_bias(pinhole, &self.depth_bias)
+                .classify(pinhole, &(self.poses[o.pose] * self.points[o.point]).coords);
         }
     }
 
     /// The robust cost of all trusted observations. Infinite if a point lies behind a camera that sees it, so that no step goes there.
     pub fn cost(&self, pinhole: &Pinhole) -> f64 {
-        let mut sum = 0.0;
+        let mut sum = self.bias_prior.map_or(0.0, |prior| prior.pull(&self.depth_bias).1);
         for o in &self.observations {
-            let Some(measurement) = o.measurement.restricted_to(o.class) else { continue };
+            let Some(measurement) = self.measurement(o, pinhole) else { continue };
             match measurement.residual(pinhole, &(self.poses[o.pose] * self.points[o.point]).coords) {
                 Some(r) => sum += Measurement::robust(&r).0,
                 None => return f64::INFINITY,
@@ -111,45 +122,80 @@ impl BundleProblem {
         sum
     }
 
+    /// An observation's measurement as far as it is trusted, freed of the bias.
+    fn measurement(&self, observation: &BundleObservation, pinhole: &Pinhole) -> Option<Measurement> {
+        Some(observation.measurement.restricted_to(observation.class)?.without_bias(pinhole, &self.depth_bias))
+    }
+
+    fn blocks(&self) -> usize {
+        self.free_poses + usize::from(self.bias_prior.is_some())
+    }
+
     fn linearise(&self, pinhole: &Pinhole) -> System {
         let mut system = System {
-            hessian_poses: vec![Matrix6::zeros(); self.free_poses],
-            gradient_poses: vec![Vector6::zeros(); self.free_poses],
+            hessian_blocks: vec![Matrix6::zeros(); self.blocks()],
+            gradient_blocks: vec![Vector6::zeros(); self.blocks()],
+            bias_by_pose: vec![Matrix6::zeros(); self.free_poses],
             hessian_points: vec![Matrix3::zeros(); self.points.len()],
             gradient_points: vec![Vector3::zeros(); self.points.len()],
-            mixed: Vec::with_capacity(self.observations.len()),
+            mixed: Vec::with_capacity(self.observations.len() + self.points.len()),
         };
-        for (index, o) in self.observations.iter().enumerate() {
-            let Some(measurement) = o.measurement.restricted_to(o.class) else { continue };
-            let pose = &self.poses[o.pose];
-            let p_in_camera = (pose * self.points[o.point]).coords;
-            let Some(residual) = measurement.residual(pinhole, &p_in_camera) else { continue };
-            let weights = Matrix3::from_diagonal(&Measurement::robust(&residual).1);
-            let by_camera_point = measurement.jacobian(pinhole, &p_in_camera);
-            let by_point = by_camera_point * pose.rotation.to_rotation_matrix().matrix();
-            let weighted = by_point.transpose() * weights;
-            system.hessian_points[o.point] += weighted * by_point;
-            system.gradient_points[o.point] += weighted * residual;
-            if o.pose < self.free_poses {
-                let by_pose = by_camera_point * point_by_pose(&p_in_camera);
-                let weighted = by_pose.transpose() * weights;
-                system.hessian_poses[o.pose] += weighted * by_pose;
-                system.gradient_poses[o.pose] += weighted * residual;
-                system.mixed.push(Mixed { observation: index, pose: o.pose, pose_by_point: weighted * by_point });
+        let bias = self.free_poses;
+        if let Some(prior) = &self.bias_prior {
+            system.hessian_blocks[bias] = Matrix6::from_diagonal(&padded(&prior.information));
+            system.gradient_blocks[bias] = padded(&prior.pull(&self.depth_bias).0);
+        }
+        for group in self.observations.chunk_by(|a, b| a.point == b.point) {
+            let point = group[0].point;
+            let mut bias_by_point = Matrix6x3::zeros();
+            for o in group {
+                let Some(measurement) = self.measurement(o, pinhole) else { continue };
+                let pose = &self.poses[o.pose];
+                let p_in_camera = (pose * self.points[point]).coords;
+                let Some(residual) = measurement.residual(pinhole, &p_in_camera) else { continue };
+                let weights = Matrix3::from_diagonal(&Measurement::robust(&residual).1);
+                let by_camera_point = measurement.jacobian(pinhole, &p_in_camera);
+                let by_point = by_camera_point * pose.rotation.to_rotation_matrix().matrix();
+                let weighted = by_point.transpose() * weights;
+                system.hessian_points[point] += weighted * by_point;
+                system.gradient_points[point] += weighted * residual;
+                let by_pose = (o.pose < bias).then(|| by_camera_point * point_by_pose(&p_in_camera));
+                if let Some(by_pose) = &by_pose {
+                    let weighted = by_pose.transpose() * weights;
+                    system.hessian_blocks[o.pose] += weighted * by_pose;
+                    system.gradient_blocks[o.pose] += weighted * residual;
+                    system.mixed.push(Mixed { point, block: o.pose, block_by_point: weighted * by_point });
+                }
+                if self.bias_prior.is_some() && measurement.inverse_depth.is_some() {
+                    // Of the residual's third entry alone.
+                    let by_bias = padded(&DepthBias::terms(pinhole, &measurement.pixel)) * measurement.depth_weight;
+                    let weighted = by_bias * weights[(2, 2)];
+                    system.hessian_blocks[bias] += weighted * by_bias.transpose();
+                    system.gradient_blocks[bias] += weighted * residual.z;
+                    bias_by_point += weighted * by_point.row(2);
+                    if let Some(by_pose) = &by_pose {
+                        system.bias_by_pose[o.pose] += weighted * by_pose.row(2);
+                    }
+                }
+            }
+            if self.bias_prior.is_some() {
+                system.mixed.push(Mixed { point, block: bias, block_by_point: bias_by_point });
             }
         }
         system
     }
 
-    /// Sparsity of the reduced camera system; `None` if it has too many blocks.
+    /// Sparsity of the reduced system; `None` if it has too many blocks.
     fn reduced_system(&self) -> Option<ReducedSystem> {
-        let is_free = |pose: &usize| *pose < self.free_poses;
+        let bias = self.free_poses;
+        let is_free = |pose: &usize| *pose < bias;
         let seen = self.observations.chunk_by(|a, b| a.point == b.point).flat_map(|group| {
             let poses: Vec<usize> = group.iter().map(|o| o.pose).filter(is_free).collect();
             let pairs: Vec<(usize, usize)> = poses.iter().flat_map(|a| poses.iter().map(|b| (*a, *b))).collect();
             pairs
         });
-        ReducedSystem::new(self.free_poses, seen)
+        let with_bias = (0..if self.bias_prior.is_some() { bias } else { 0 }).map(|pose| (bias, pose));
+        ReducedSystem::new(self.blocks(), seen.chain(with_bias))
     }
 
     /// Takes one damped step; `false` if the equations cannot be solved.
@@ -159,15 +205,17 @@ impl BundleProblem {
             .iter()
             .map(|h| damped3(h, lambda).try_inverse().filter(|m| m.iter().all(|v| v.is_finite())))
             .collect();
-        let Some(pose_steps) = self.solve_poses(system, reduced, &point_inverses, lambda) else { return false };
+        let Some(steps) = solve_blocks(system, reduced, &point_inverses, lambda) else { return false };
         let mut right: Vec<Vector3<f64>> = system.gradient_points.iter().map(|g| -g).collect();
         for m in &system.mixed {
-            let step = Vector6::from_column_slice(&pose_steps[6 * m.pose..][..6]);
-            right[self.observations[m.observation].point] -= m.pose_by_point.transpose() * step;
+            right[m.point] -= m.block_by_point.transpose() * steps[m.block];
         }
-        for (pose, step) in self.poses.iter_mut().zip(pose_steps.chunks_exact(6)) {
-            *pose = se3::exp(&Vector6::from_column_slice(step)) * *pose;
+        for (pose, step) in self.poses[..self.free_poses].iter_mut().zip(&steps) {
+            *pose = se3::exp(step) * *pose;
             pose.rotation.renormalize();
+        }
+        if self.bias_prior.is_some() {
+            self.depth_bias.0 += steps[self.free_poses].fixed_rows::<3>(0);
         }
         for ((point, inverse), r) in self.points.iter_mut().zip(&point_inverses).zip(&right) {
             if let Some(inverse) = inverse {
@@ -176,38 +224,48 @@ impl BundleProblem {
         }
         true
     }
+}
 
-    /// The poses' steps from the reduced camera system, 6 entries for each free pose.
-    fn solve_poses(
-        &self,
-        system: &System,
-        reduced: &ReducedSystem,
-        point_inverses: &[Option<Matrix3<f64>>],
-        lambda: f64,
-    ) -> Option<Vec<f64>> {
-        let mut blocks = reduced.zeros();
-        let mut right: Vec<Vector6<f64>> = system.gradient_poses.iter().map(|g| -g).collect();
-        for (k, h) in system.hessian_poses.iter().enumerate() {
-            let damped = &mut blocks[reduced.place(k, k)];
-            *damped = *h;
-            (0..6).for_each(|i| damped[(i, i)] += lambda * h[(i, i)] + 1e-9);
+/// The blocks' steps from the reduced system.
+fn solve_blocks(
+    system: &System,
+    reduced: &ReducedSystem,
+    point_inverses: &[Option<Matrix3<f64>>],
+    lambda: f64,
+) -> Option<Vec<Vector6<f64>>> {
+    let mut blocks = reduced.zeros();
+    let mut right: Vec<Vector6<f64>> = system.gradient_blocks.iter().map(|g| -g).collect();
+    for (k, h) in system.hessian_blocks.iter().enumerate() {
+        let damped = &mut blocks[reduced.place(k, k)];
+        *damped = *h;
+        (0..6).for_each(|i| damped[(i, i)] += lambda * h[(i, i)] + 1e-9);
+    }
+    let bias = system.bias_by_pose.len();
+    if bias < system.hessian_blocks.len() {
+        for (pose, coupling) in system.bias_by_pose.iter().enumerate() {
+            blocks[reduced.place(bias, pose)] = *coupling;
         }
-        let point_of = |m: &Mixed| self.observations[m.observation].point;
-        for group in system.mixed.chunk_by(|a, b| point_of(a) == point_of(b)) {
-            let point = point_of(&group[0]);
-            let Some(inverse) = &point_inverses[point] else { continue };
-            for a in group {
-                let gain = a.pose_by_point * inverse;
-                right[a.pose] += gain * system.gradient_points[point];
-                // The lower triangle is all that Cholesky reads.
-                for b in group.iter().filter(|b| b.pose <= a.pose) {
-                    blocks[reduced.place(a.pose, b.pose)] -= gain * b.pose_by_point.transpose();
-                }
+    }
+    for group in system.mixed.chunk_by(|a, b| a.point == b.point) {
+        let point = group[0].point;
+        let Some(inverse) = &point_inverses[point] else { continue };
+        for a in group {
+            let gain = a.block_by_point * inverse;
+            right[a.block] += gain * system.gradient_points[point];
+            // The lower triangle is all that Cholesky reads.
+            for b in group.iter().filter(|b| b.block <= a.block) {
+                blocks[reduced.place(a.block, b.block)] -= gain * b.block_by_point.transpose();
             }
         }
-        let right: Vec<f64> = right.iter().flat_map(|r| r.iter().copied()).collect();
-        reduced.solve(&blocks, &right)
     }
+    let right: Vec<f64> = right.iter().flat_map(|r| r.iter().copied()).collect();
+    let steps = reduced.solve(&blocks, &right)?;
+    Some(steps.chunks_exact(6).map(Vector6::from_column_slice).collect())
+}
+
+/// The bias' three unknowns as a block of six; the others stay zero.
+fn padded(bias: &Vector3<f64>) -> Vector6<f64> {
+    bias.fixed_resize::<6, 1>(0.0)
 }
 
 fn damped3(hessian: &Matrix3<f64>, lambda: f64) -> Matrix3<f64> {

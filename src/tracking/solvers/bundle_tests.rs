@@ -73,25 +73,57 @@ fn outliers_are_found_and_do_not_pull() {
 }
 
 #[test]
+fn a_bias_of_the_depth_is_found() {
+    let (mut problem, truth) = scene(0.0, false);
+    let bias = DepthBias(Vector3::new(-0.004, 0.012, 0.02));
+    for o in &mut problem.observations {
+        let error = bias.at(&PINHOLE, &o.measurement.pixel);
+        o.measurement.inverse_depth = o.measurement.inverse_depth.map(|measured| measured + error);
+    }
+    let mut unaware = problem.clone();
+    problem.bias_prior = Some(BiasPrior { mean: DepthBias::default(), information: Vector3::repeat(1e-3) });
+    problem.solve(&PINHOLE, 50);
+    unaware.solve(&PINHOLE, 50);
+    assert!((problem.depth_bias.0 - bias.0).norm() < 1e-5, "{:?}", problem.depth_bias);
+    assert_eq!(unaware.depth_bias, DepthBias::default());
+    let (error, without) = (worst_pose_error(&problem, &truth), worst_pose_error(&unaware, &truth));
+    assert!(error < 1e-5 && without > 1e-3, "{error} {without}");
+    // A prior that is certain keeps it.
+    problem.bias_prior = Some(BiasPrior { mean: DepthBias::default(), information: Vector3::repeat(1e15) });
+    problem.solve(&PINHOLE, 50);
+    assert!(problem.depth_bias.0.norm() < 1e-6, "{:?}", problem.depth_bias);
+}
+
+#[test]
 fn the_reduced_system_steps_as_the_full_one_does() {
+    for bias_prior in [None, Some(BiasPrior::after(&DepthBias(Vector3::new(0.001, -0.002, 0.003)), 0.02))] {
+        compare_with_the_full_system(bias_prior);
+    }
+}
+
+fn compare_with_the_full_system(bias_prior: Option<BiasPrior>) {
     let (problem, _) = scene(0.5, false);
-    let problem =
-        BundleProblem { points: problem.points[..8].to_vec(), observations: problem.observations[..48].to_vec(), ..problem };
+    let (points, observations) = (problem.points[..8].to_vec(), problem.observations[..48].to_vec());
+    let problem = BundleProblem { points, observations, bias_prior, ..problem };
     let system = problem.linearise(&PINHOLE);
-    let (lambda, poses, size) = (1e-3, 24, 24 + 24);
+    let (lambda, blocks) = (1e-3, problem.blocks());
+    let (poses, size) = (6 * blocks, 6 * blocks + 24);
     let (mut full, mut right) = (DMatrix::zeros(size, size), DVector::zeros(size));
-    for k in 0..4 {
-        full.fixed_view_mut::<6, 6>(6 * k, 6 * k).copy_from(&system.hessian_poses[k]);
-        right.fixed_rows_mut::<6>(6 * k).copy_from(&-system.gradient_poses[k]);
+    for k in 0..blocks {
+        full.fixed_view_mut::<6, 6>(6 * k, 6 * k).copy_from(&system.hessian_blocks[k]);
+        right.fixed_rows_mut::<6>(6 * k).copy_from(&-system.gradient_blocks[k]);
+    }
+    for (k, coupling) in system.bias_by_pose.iter().enumerate().filter(|_| bias_prior.is_some()) {
+        full.fixed_view_mut::<6, 6>(24, 6 * k).copy_from(coupling);
+        full.fixed_view_mut::<6, 6>(6 * k, 24).copy_from(&coupling.transpose());
     }
     for k in 0..8 {
         full.fixed_view_mut::<3, 3>(poses + 3 * k, poses + 3 * k).copy_from(&system.hessian_points[k]);
         right.fixed_rows_mut::<3>(poses + 3 * k).copy_from(&-system.gradient_points[k]);
     }
     for m in &system.mixed {
-        let point = problem.observations[m.observation].point;
-        full.fixed_view_mut::<6, 3>(6 * m.pose, poses + 3 * point).copy_from(&m.pose_by_point);
-        full.fixed_view_mut::<3, 6>(poses + 3 * point, 6 * m.pose).copy_from(&m.pose_by_point.transpose());
+        full.fixed_view_mut::<6, 3>(6 * m.block, poses + 3 * m.point).copy_from(&m.block_by_point);
+        full.fixed_view_mut::<3, 6>(poses + 3 * m.point, 6 * m.block).copy_from(&m.block_by_point.transpose());
     }
     (0..size).for_each(|k| full[(k, k)] += lambda * full[(k, k)] + 1e-9);
     let expected = full.lu().solve(&right).unwrap();
@@ -101,6 +133,9 @@ fn the_reduced_system_steps_as_the_full_one_does() {
     for k in 0..4 {
         let step = se3::log(&(stepped.poses[k] * problem.poses[k].inverse()));
         assert!((step - expected.rows(6 * k, 6)).norm() < 1e-8);
+    }
+    if bias_prior.is_some() {
+        assert!((stepped.depth_bias.0 - expected.fixed_rows::<3>(24)).norm() < 1e-8);
     }
     for k in 0..8 {
         assert!((stepped.points[k] - problem.points[k] - expected.rows(poses + 3 * k, 3)).norm() < 1e-8);

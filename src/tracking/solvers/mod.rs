@@ -1,6 +1,7 @@
 //! Residuals and least-squares solvers: poses, bundle adjustment, pose graphs, alignment. None knows the map.
 
 pub mod bundle;
+pub mod depth_bias;
 pub mod epipolar;
 pub mod intrinsics;
 pub mod pose;

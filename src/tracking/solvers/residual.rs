@@ -8,6 +8,7 @@ use nalgebra::{Matrix3, Matrix3x6, Vector2, Vector3};
 
 use crate::geometry::Pinhole;
 use crate::geometry::se3::skew;
+use crate::tracking::solvers::depth_bias::DepthBias;
 
 /// 95% of true pixels lie below this (χ², 2 degrees of freedom).
 const CHI2_PIXEL: f64 = 5.991;
@@ -62,6 +63,11 @@ impl Measurement {
         let (fx, fy) = (pinhole.fx * iz * self.pixel_weight, pinhole.fy * iz * self.pixel_weight);
         let depth = if self.inverse_depth.is_some() { -iz * iz * self.depth_weight } else { 0.0 };
         Matrix3::new(fx, 0.0, -fx * p.x * iz, 0.0, fy, -fy * p.y * iz, 0.0, 0.0, depth)
+    }
+
+    /// A copy whose inverse depth is freed of its bias.
+    pub fn without_bias(&self, pinhole: &Pinhole, bias: &DepthBias) -> Self {
+        Self { inverse_depth: self.inverse_depth.map(|measured| measured - bias.at(pinhole, &self.pixel)), ..*self }
     }
 
     /// A copy without depth.

@@ -130,6 +130,7 @@ impl Tracker {
             return self.begin_next(times);
         }
         solved.apply(&mut self.map, &self.rig.config).into_iter().for_each(|k| self.note_move(k, 1.0));
+        self.rig.depth_bias = solved.bias().unwrap_or(self.rig.depth_bias);
         times.bundle_ms += milliseconds(clock);
         self.close_loops_and_cull(under_way.around, times)?;
         self.follow_keyframe();
@@ -144,12 +145,18 @@ impl Tracker {
         let Some(Waiting { keyframe, held }) = self.adjusting.waiting.take() else { return Ok(()) };
         let clock = Instant::now();
         // A keyframe that few landmarks hold would be torn from where its pixels put it.
-        let window = held.then(|| Adjustment::of_window(&self.map, keyframe, &self.rig.config)).flatten();
+        let window = held.then(|| Adjustment::of_window(&self.map, keyframe, &self.rig)).flatten();
+        let window = window.map(|w| if self.seeks_bias() { w.with_bias(&self.rig) } else { w });
         times.bundle_ms += milliseconds(clock);
         match window {
             Some(window) => self.begin(window, keyframe),
             None => self.close_loops_and_cull(keyframe, times),
         }
+    }
+
+    /// Rectified pairs are calibrated together, and a camera that drives forwards hardly shows a bias: depth images only.
+    pub(super) fn seeks_bias(&self) -> bool {
+        self.rig.config.depth_bias && self.sensor == Sensor::Rgbd
     }
 
     fn begin(&mut self, adjustment: Adjustment, around: usize) -> Result<(), TrackingError> {

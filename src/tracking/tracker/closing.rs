@@ -147,15 +147,15 @@ impl Tracker {
             return self.give_closing(Job::Correct(correction), later);
         }
         let Some(first) = self.closing.unsettled.front().copied() else { return Ok(()) };
-        let (root, config) = (self.map.keyframes[first].root, &self.rig.config);
-        if let Some(all) = Adjustment::of_all(&self.map, root, config) {
+        let root = self.map.keyframes[first].root;
+        if let Some(all) = Adjustment::of_all(&self.map, root, &self.rig) {
             self.closing.unsettled.clear();
             let later = 1 + all.problem.observations.len() / OBSERVATIONS_A_FRAME;
             return self.give_closing(Job::Adjust(all, Extent::All), later);
         }
         while let Some(keyframe) = self.closing.unsettled.pop_front() {
             let lives = !self.map.culled.contains_key(&keyframe);
-            let window = lives.then(|| Adjustment::of_window(&self.map, keyframe, &self.rig.config)).flatten();
+            let window = lives.then(|| Adjustment::of_window(&self.map, keyframe, &self.rig)).flatten();
             if let Some(window) = window {
                 let later = 1 + window.problem.observations.len() / OBSERVATIONS_A_FRAME;
                 return self.give_closing(Job::Adjust(window, Extent::Window), later);

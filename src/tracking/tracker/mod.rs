@@ -30,6 +30,7 @@ use crate::tracking::map::insertion;
 use crate::tracking::map::sparse_map::{Keyframe, Map};
 use crate::tracking::map::triangulation;
 use crate::tracking::rig::Rig;
+use crate::tracking::solvers::depth_bias::DepthBias;
 use crate::tracking::worker::Worker;
 use crate::tracking::{KeyframePose, NewKeyframe, StageTimes, TrackedFrame, TrackingConfig, TrackingError, TrackingState};
 
@@ -125,7 +126,7 @@ impl Tracker {
         let solve = move |adjustment: &mut Adjustment| adjustment.solve(&pinhole, steps);
         let worker = Worker::start("adjusting", solve)?;
         Ok(Self {
-            rig: Rig { pinhole, config },
+            rig: Rig::new(pinhole, config),
             sensor,
             front_end,
             dense: DenseState::default(),
@@ -235,6 +236,11 @@ impl Tracker {
     /// Loops closed so far, submaps joined among them.
     pub fn loops(&self) -> Vec<ClosedLoop> {
         self.loops.loops()
+    }
+
+    /// The systematic error of the depth images; `None` if it was not estimated.
+    pub fn depth_bias(&self) -> Option<DepthBias> {
+        self.seeks_bias().then_some(self.rig.depth_bias)
     }
 
     /// How many keyframes there have been, of all submaps.

@@ -1,0 +1,59 @@
+//! The systematic error of measured depth, which bundle adjustment finds beside poses and points.
+//!
+//! Structured light measures disparity. Errors of its calibration, and of its registration with the colour camera, are therefore smooth over the
+//! image in inverse depth (Herrera C. et al., *Joint depth and color camera calibration with distortion correction*, 2012).
+
+use nalgebra::{Vector2, Vector3};
+
+use crate::geometry::Pinhole;
+
+/// How far a coefficient moves from one adjustment to the next, in standard deviations of a measurement: the offset, and the tilts.
+const STEP: Vector3<f64> = Vector3::new(0.012, 0.04, 0.04);
+/// How large it is in all, likewise.
+const SIZE: Vector3<f64> = Vector3::new(0.12, 0.4, 0.4);
+
+/// Measured inverse depth minus the true one, 1/metres: a plane over the image. Offset, tilt along x, tilt along y, each for half the image's
+/// width.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct DepthBias(pub Vector3<f64>);
+
+impl DepthBias {
+    /// What the coefficients are multiplied by at a pixel.
+    pub fn terms(pinhole: &Pinhole, pixel: &Vector2<f64>) -> Vector3<f64> {
+        let half = 0.5 * f64::from(pinhole.width);
+        Vector3::new(1.0, (pixel.x - pinhole.cx) / half, (pixel.y - pinhole.cy) / half)
+    }
+
+    /// The bias at a pixel, 1/metres.
+    pub fn at(&self, pinhole: &Pinhole, pixel: &Vector2<f64>) -> f64 {
+        self.0.dot(&Self::terms(pinhole, pixel))
+    }
+}
+
+/// A Gaussian over the coefficients.
+#[derive(Clone, Copy, Debug)]
+pub struct BiasPrior {
+    pub mean: DepthBias,
+    /// 1/variance of each coefficient, metres².
+    pub information: Vector3<f64>,
+}
+
+impl BiasPrior {
+    /// For an adjustment after one that found `last`; `sigma` is the standard deviation of a measured inverse depth, 1/metres.
+    ///
+    /// Each keyframe's depth has errors of its own, so that no window decides alone. An offset hardly differs from a change of scale, so that
+    /// the coefficients are drawn to zero.
+    pub fn after(last: &DepthBias, sigma: f64) -> Self {
+        let near = (STEP * sigma).map(|s| s.powi(-2));
+        let small = (SIZE * sigma).map(|s| s.powi(-2));
+        let information = near + small;
+        Self { mean: DepthBias(last.0.component_mul(&near).component_div(&information)), information }
+    }
+
+    /// Half of the cost's gradient, and the cost.
+    pub fn pull(&self, bias: &DepthBias) -> (Vector3<f64>, f64) {
+        let error = bias.0 - self.mean.0;
+        let gradient = error.component_mul(&self.information);
+        (gradient, gradient.dot(&error))
+    }
+}
