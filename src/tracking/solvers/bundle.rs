@@ -8,7 +8,7 @@ use nalgebra::{Matrix3, Matrix6, Matrix6x3, Point3, Vector3, Vector6};
 
 use crate::geometry::{Pinhole, Se3, se3};
 use crate::tracking::solvers::depth_bias::{BiasPrior, DepthBias};
-use crate::tracking::solvers::residual::{InlierClass, Measurement, point_by_pose};
+use crate::tracking::solvers::residual::{InlierClass, Measurement};
 use crate::tracking::solvers::schur::ReducedSystem;
 
 /// Damping that gives up: no step helps any more.
@@ -140,6 +140,7 @@ impl BundleProblem {
             gradient_points: vec![Vector3::zeros(); self.points.len()],
             mixed: Vec::with_capacity(self.observations.len() + self.points.len()),
         };
+        let rotations: Vec<Matrix3<f64>> = self.poses.iter().map(|p| *p.rotation.to_rotation_matrix().matrix()).collect();
         let bias = self.free_poses;
         if let Some(prior) = &self.bias_prior {
             system.hessian_blocks[bias] = Matrix6::from_diagonal(&padded(&prior.information));
@@ -155,11 +156,11 @@ impl BundleProblem {
                 let Some(residual) = measurement.residual(pinhole, &p_in_camera) else { continue };
                 let weights = Matrix3::from_diagonal(&Measurement::robust(&residual).1);
                 let by_camera_point = measurement.jacobian(pinhole, &p_in_camera);
-                let by_point = by_camera_point * pose.rotation.to_rotation_matrix().matrix();
+                let by_point = by_camera_point * rotations[o.pose];
                 let weighted = by_point.transpose() * weights;
                 system.hessian_points[point] += weighted * by_point;
                 system.gradient_points[point] += weighted * residual;
-                let by_pose = (o.pose < bias).then(|| by_camera_point * point_by_pose(&p_in_camera));
+                let by_pose = (o.pose < bias).then(|| measurement.jacobian_by_pose(pinhole, &p_in_camera));
                 if let Some(by_pose) = &by_pose {
                     let weighted = by_pose.transpose() * weights;
                     system.hessian_blocks[o.pose] += weighted * by_pose;

@@ -3,17 +3,18 @@
 //! Several rounds; after each, every measurement is classified anew by χ² and may come back. Early rounds use Huber's kernel
 //! (Mur-Artal & Tardós, *ORB-SLAM2*, 2017, sec. III-C). A measurement whose depth alone disagrees keeps its pixel.
 
-use nalgebra::{Matrix3, Matrix6, Point3, Vector3, Vector6};
+use nalgebra::{Matrix6, Point3, Vector3, Vector6};
 
 use crate::geometry::{Pinhole, Se3, se3};
-use crate::tracking::solvers::residual::{InlierClass, Measurement, point_by_pose};
+use crate::tracking::solvers::residual::{InlierClass, Measurement};
 
 const ROUNDS: usize = 4;
 const STEPS_PER_ROUND: usize = 8;
 /// The last rounds run on inliers, without Huber's kernel.
 const ROBUST_ROUNDS: usize = 2;
-/// Steps below this (metres and radians together) have converged.
+/// Steps below this (metres and radians together) have converged: in the last round, and in those before it.
 const CONVERGED: f64 = 1e-7;
+const NEARLY_CONVERGED: f64 = 1e-5;
 /// Six unknowns need three pixels at least; with fewer measurements there is nothing to solve.
 const MIN_OBSERVATIONS: usize = 3;
 
@@ -49,7 +50,8 @@ pub fn optimise_pose(pinhole: &Pinhole, initial: &Se3, observations: &[PoseObser
                 inliers: 0,
             };
         }
-        pose = refine(pinhole, &pose, observations, &classes, round < ROBUST_ROUNDS);
+        let converged = if round + 1 == ROUNDS { CONVERGED } else { NEARLY_CONVERGED };
+        pose = refine(pinhole, &pose, observations, &classes, (round < ROBUST_ROUNDS, converged));
         for (t, o) in classes.iter_mut().zip(observations) {
             *t = o.measurement.classify(pinhole, &(pose * o.point_in_world).coords);
         }
@@ -58,8 +60,14 @@ pub fn optimise_pose(pinhole: &Pinhole, initial: &Se3, observations: &[PoseObser
     PoseEstimate { camera_from_world: pose, classes, inliers }
 }
 
-/// Levenberg-Marquardt over the trusted observations.
-fn refine(pinhole: &Pinhole, initial: &Se3, observations: &[PoseObservation], classes: &[InlierClass], robust: bool) -> Se3 {
+/// Levenberg-Marquardt over the trusted observations, with Huber's kernel if `robust`, until a step is below `converged`.
+fn refine(
+    pinhole: &Pinhole,
+    initial: &Se3,
+    observations: &[PoseObservation],
+    classes: &[InlierClass],
+    (robust, converged): (bool, f64),
+) -> Se3 {
     let mut pose = *initial;
     let mut lambda = 1e-4;
     let (mut hessian, mut gradient, mut cost) = linearise(pinhole, &pose, observations, classes, robust);
@@ -77,7 +85,7 @@ fn refine(pinhole: &Pinhole, initial: &Se3, observations: &[PoseObservation], cl
         } else {
             lambda *= 10.0;
         }
-        if step.norm() < CONVERGED {
+        if step.norm() < converged {
             break;
         }
     }
@@ -104,12 +112,17 @@ fn linearise(
         };
         let (rho, weights) =
             if robust { Measurement::robust(&residual) } else { (residual.norm_squared(), Vector3::repeat(1.0)) };
-        let j = measurement.jacobian(pinhole, &p_in_camera) * point_by_pose(&p_in_camera);
-        let weighted = j.transpose() * Matrix3::from_diagonal(&weights);
-        hessian += weighted * j;
-        gradient += weighted * residual;
+        let j = measurement.jacobian_by_pose(pinhole, &p_in_camera);
+        for row in 0..6 {
+            let weighted = j.column(row).component_mul(&weights);
+            gradient[row] += weighted.dot(&residual);
+            for column in 0..=row {
+                hessian[(row, column)] += weighted.dot(&j.column(column));
+            }
+        }
         cost += rho;
     }
+    hessian.fill_upper_triangle_with_lower_triangle();
     (hessian, gradient, cost)
 }
 

@@ -65,6 +65,32 @@ impl Measurement {
         Matrix3::new(fx, 0.0, -fx * p.x * iz, 0.0, fy, -fy * p.y * iz, 0.0, 0.0, depth)
     }
 
+    /// Derivative of [`Self::residual`] by a left perturbation of `camera_from_world`: that by the point times `[I, −skew(p)]`, written out.
+    pub fn jacobian_by_pose(&self, pinhole: &Pinhole, p: &Vector3<f64>) -> Matrix3x6<f64> {
+        let j = self.jacobian(pinhole, p);
+        let (a, b, c, d, e) = (j[(0, 0)], j[(0, 2)], j[(1, 1)], j[(1, 2)], j[(2, 2)]);
+        Matrix3x6::from_row_slice(&[
+            a,
+            0.0,
+            b,
+            b * p.y,
+            a * p.z - b * p.x,
+            -a * p.y,
+            0.0,
+            c,
+            d,
+            d * p.y - c * p.z,
+            -d * p.x,
+            c * p.x,
+            0.0,
+            0.0,
+            e,
+            e * p.y,
+            -e * p.x,
+            0.0,
+        ])
+    }
+
     /// A copy whose inverse depth is freed of its bias.
     pub fn without_bias(&self, pinhole: &Pinhole, bias: &DepthBias) -> Self {
         Self { inverse_depth: self.inverse_depth.map(|measured| measured - bias.at(pinhole, &self.pixel)), ..*self }
@@ -145,7 +171,7 @@ pub(crate) mod tests {
             let at = |pose: &Se3, point: &nalgebra::Point3<f64>| measurement.residual(&PINHOLE, &(pose * point).coords).unwrap();
             let p_in_camera = (camera_from_world * p_in_world).coords;
             let j = measurement.jacobian(&PINHOLE, &p_in_camera);
-            let (by_pose, by_point) = (j * point_by_pose(&p_in_camera), j * camera_from_world.rotation.to_rotation_matrix().matrix());
+            let (by_pose, by_point) = (measurement.jacobian_by_pose(&PINHOLE, &p_in_camera), j * camera_from_world.rotation.to_rotation_matrix().matrix());
             const STEP: f64 = 1e-6;
             let mut numeric_pose = Matrix3x6::zeros();
             for k in 0..6 {
