@@ -100,7 +100,7 @@ impl Adjustment {
         let free = &self.keyframes[..self.problem.free_poses];
         let mut before: BTreeMap<usize, Se3> = BTreeMap::new();
         for (k, pose) in free.iter().zip(&self.problem.poses) {
-            if map.culled.contains_key(k) {
+            if map.is_culled(*k) {
                 continue;
             }
             before.insert(*k, map.keyframes[*k].camera_from_world);

@@ -40,7 +40,9 @@ pub struct FrameFeatures {
 
 impl FrameFeatures {
     /// Features of a list, put in a grid.
-    pub fn new(features: Vec<Feature>, pinhole: &Pinhole) -> Self {
+    pub fn new(mut features: Vec<Feature>, pinhole: &Pinhole) -> Self {
+        // A keyframe keeps them.
+        features.shrink_to_fit();
         let columns = (f64::from(pinhole.width) / CELL_PIXELS).ceil().max(1.0) as usize;
         let rows = (f64::from(pinhole.height) / CELL_PIXELS).ceil().max(1.0) as usize;
         let cell_of = |f: &Feature| cell(f.pixel.y, rows) * columns + cell(f.pixel.x, columns);

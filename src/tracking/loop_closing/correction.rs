@@ -2,8 +2,6 @@
 //! them first, and what turned out to be the same is joined (Mur-Artal, Montiel & Tardós, *ORB-SLAM*, 2015: the *essential graph*). The
 //! bundle adjustment that settles the rest is up to the caller.
 
-use std::collections::BTreeMap;
-
 use crate::geometry::sim3::Vector7;
 use crate::geometry::{Se3, Sim3};
 use crate::tracking::TrackingConfig;
@@ -108,31 +106,33 @@ impl Correction {
     /// Takes the result into the map; `edges` follow what they were measured in. Keyframes that came since go with the newest of those
     /// before. Returns the keyframes that may have moved, in ascending order.
     pub fn apply(&self, map: &mut Map, edges: &mut [Edge], rig: &Rig) -> Vec<MovedKeyframe> {
-        let mut grown: BTreeMap<usize, f64> = BTreeMap::new();
+        let mut moved: Vec<MovedKeyframe> = Vec::new();
         let mut newest = None;
         for ((keyframe, before), after) in self.keyframes.iter().zip(&self.before).zip(&self.graph.poses) {
             let before = Sim3::from(*before);
             newest = Some((before, *after));
-            if !map.culled.contains_key(keyframe) && *after != before {
-                move_keyframe(map, *keyframe, &before, after, &mut grown);
+            if !map.is_culled(*keyframe) && *after != before {
+                move_keyframe(map, *keyframe, &before, after, &mut moved);
             }
         }
         let root = self.keyframes.first().map(|k| map.keyframes[*k].root);
         if let Some((before, after)) = newest.filter(|(before, after)| before != after) {
             for keyframe in self.known..map.keyframes.len() {
-                if Some(map.keyframes[keyframe].root) == root && !map.culled.contains_key(&keyframe) {
-                    move_keyframe(map, keyframe, &before, &after, &mut grown);
+                if Some(map.keyframes[keyframe].root) == root && !map.is_culled(keyframe) {
+                    move_keyframe(map, keyframe, &before, &after, &mut moved);
                 }
             }
         }
+        // Each moved once: by itself, or with its parent.
+        moved.sort_unstable_by_key(|m| m.keyframe);
         for edge in edges {
-            let growth = |k: usize| grown.get(&k).copied().unwrap_or(1.0);
+            let growth = |k: usize| moved.binary_search_by_key(&k, |m| m.keyframe).map_or(1.0, |i| moved[i].growth);
             edge.a_from_b.translation *= growth(edge.a);
             edge.a_from_b.scale *= growth(edge.a) / growth(edge.b);
         }
         map.corrections += 1;
         self.fuse(map, rig);
-        grown.into_iter().map(|(keyframe, growth)| MovedKeyframe { keyframe, growth }).collect()
+        moved
     }
 
     /// Joins the place's landmarks with those of the keyframe, of its neighbours, and of the newest ones, which have seen it since.
@@ -141,7 +141,7 @@ impl Correction {
         let connected = map.covisible(keyframe).into_iter().filter(|(_, shared)| *shared >= CONNECTED_SHARED);
         let mut around: Vec<usize> = connected.map(|(k, _)| k).take(FUSED_NEIGHBOURS).collect();
         let since = (self.known..map.keyframes.len()).rev().take(FUSED_NEIGHBOURS);
-        let lives = |k: &usize| !map.culled.contains_key(k) && map.connects(*k, keyframe);
+        let lives = |k: &usize| !map.is_culled(*k) && map.connects(*k, keyframe);
         let since: Vec<usize> = since.filter(|k| lives(k) && !around.contains(k)).collect();
         around.extend(since);
         take_over(map, &self.found, self.known, &rig.config);
@@ -152,13 +152,12 @@ impl Correction {
 }
 
 /// Moves a keyframe, with what hangs on it, as one that was at `before` has moved to `after`.
-fn move_keyframe(map: &mut Map, keyframe: usize, before: &Sim3, after: &Sim3, grown: &mut BTreeMap<usize, f64>) {
+fn move_keyframe(map: &mut Map, keyframe: usize, before: &Sim3, after: &Sim3, moved: &mut Vec<MovedKeyframe>) {
     let pose = Sim3::from(map.keyframes[keyframe].camera_from_world) * before.inverse() * *after;
     let growth = 1.0 / pose.scale;
-    for k in map.with_carried(keyframe).collect::<Vec<_>>() {
-        map.keyframes[k].unit *= growth;
-        grown.insert(k, growth);
-    }
+    let first = moved.len();
+    moved.extend(map.with_carried(keyframe).map(|keyframe| MovedKeyframe { keyframe, growth }));
+    moved[first..].iter().for_each(|m| map.keyframes[m.keyframe].unit *= growth);
     map.set_pose(keyframe, pose.to_rigid());
 }
 

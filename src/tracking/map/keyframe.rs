@@ -12,6 +12,8 @@ use crate::tracking::map::sparse_map::Map;
 pub struct Keyframe {
     /// The first keyframe of its submap. Submaps have no landmark in common and no known relative pose.
     pub root: usize,
+    /// The living keyframe that it goes with, once it has been culled.
+    pub parent: Option<usize>,
     pub frame_index: usize,
     pub timestamp_s: f64,
     pub camera_from_world: Se3,
@@ -33,20 +35,12 @@ pub struct Travelled {
     pub radians: f64,
 }
 
-/// A culled keyframe, rigidly attached to its parent.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct CulledKeyframe {
-    /// A keyframe that has not been culled.
-    pub parent: usize,
-    /// In the parent's unit of length.
-    pub camera_from_parent: Se3,
-}
-
 impl Keyframe {
     /// A keyframe without landmarks, in the first submap.
     pub fn new(frame_index: usize, timestamp_s: f64, camera_from_world: Se3, features: Arc<FrameFeatures>) -> Self {
         Self {
             root: 0,
+            parent: None,
             frame_index,
             timestamp_s,
             camera_from_world,

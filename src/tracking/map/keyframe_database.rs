@@ -8,6 +8,7 @@
 use crate::tracking::features::descriptor::Descriptor;
 use crate::tracking::features::frame_features::Feature;
 use crate::tracking::map::tally::{distinct, tally};
+use crate::tracking::map::trim;
 
 /// Descriptors in a leaf before it is split.
 const LEAF_CAPACITY: usize = 32;
@@ -41,6 +42,12 @@ enum Node {
     },
 }
 
+/// A leaf, and the inner node above it.
+struct Place {
+    leaf: usize,
+    parent: Option<usize>,
+}
+
 /// The descriptors of all keyframes.
 #[derive(Clone, Debug)]
 pub struct KeyframeDatabase {
@@ -48,11 +55,13 @@ pub struct KeyframeDatabase {
     nodes: Vec<Node>,
     /// Number of features, by keyframe; 0 for those that were never inserted.
     features: Vec<usize>,
+    /// Pairs of nodes that are no more; their places are used again.
+    free: Vec<[usize; 2]>,
 }
 
 impl Default for KeyframeDatabase {
     fn default() -> Self {
-        Self { nodes: vec![Node::Leaf(Vec::new())], features: Vec::new() }
+        Self { nodes: vec![Node::Leaf(Vec::new())], features: Vec::new(), free: Vec::new() }
     }
 }
 
@@ -72,11 +81,22 @@ impl KeyframeDatabase {
             *count = 0;
         }
         for feature in features {
-            let node = self.leaf(&feature.descriptor);
-            if let Node::Leaf(entries) = &mut self.nodes[node] {
-                entries.retain(|e| e.keyframe as usize != keyframe);
+            let Place { leaf, parent } = self.place(&feature.descriptor);
+            let Node::Leaf(entries) = &mut self.nodes[leaf] else { continue };
+            entries.retain(|e| e.keyframe as usize != keyframe);
+            trim(entries);
+            if let Some(parent) = parent.filter(|_| entries.is_empty()) {
+                self.close(parent, leaf);
             }
         }
+    }
+
+    /// Gives up an empty leaf: its sibling takes their parent's place.
+    fn close(&mut self, parent: usize, leaf: usize) {
+        let Node::Split { children, .. } = self.nodes[parent] else { return };
+        let sibling = if children[0] == leaf { children[1] } else { children[0] };
+        self.nodes[parent] = std::mem::replace(&mut self.nodes[sibling], Node::Leaf(Vec::new()));
+        self.free.push(children);
     }
 
     /// The keyframes that show some of these features, most alike first, then newest first.
@@ -96,7 +116,6 @@ impl KeyframeDatabase {
 
     fn insert_entry(&mut self, entry: Entry) {
         let node = self.leaf(&entry.descriptor);
-        let next = self.nodes.len();
         let Node::Leaf(entries) = &mut self.nodes[node] else { return };
         entries.push(entry);
         // A leaf that could not be split is tried again when it has doubled.
@@ -108,18 +127,25 @@ impl KeyframeDatabase {
         }
         if let Some(bit) = dividing_bit(entries) {
             let (ones, zeros) = std::mem::take(entries).into_iter().partition(|e| e.descriptor.bit(bit) == 1);
-            self.nodes[node] = Node::Split { bit, children: [next, next + 1] };
-            self.nodes.extend([Node::Leaf(zeros), Node::Leaf(ones)]);
+            let next = self.nodes.len();
+            let children = self.free.pop().unwrap_or([next, next + 1]);
+            self.nodes.resize_with(next.max(children[1] + 1), || Node::Leaf(Vec::new()));
+            self.nodes[node] = Node::Split { bit, children };
+            (self.nodes[children[0]], self.nodes[children[1]]) = (Node::Leaf(zeros), Node::Leaf(ones));
         }
     }
 
     /// The leaf that a descriptor leads to.
     fn leaf(&self, descriptor: &Descriptor) -> usize {
-        let mut node = 0;
-        while let Node::Split { bit, children } = self.nodes[node] {
-            node = children[descriptor.bit(bit)];
+        self.place(descriptor).leaf
+    }
+
+    fn place(&self, descriptor: &Descriptor) -> Place {
+        let mut place = Place { leaf: 0, parent: None };
+        while let Node::Split { bit, children } = self.nodes[place.leaf] {
+            place = Place { leaf: children[descriptor.bit(bit)], parent: Some(place.leaf) };
         }
-        node
+        place
     }
 }
 
@@ -198,6 +224,29 @@ mod tests {
         let strange = seen_again(&keyframes[20], 4000, &mut random);
         assert!(build().query(&strange).first().is_none_or(|r| r.score < 0.01));
         assert!(KeyframeDatabase::default().query(&query).is_empty() && build().query(&[]).is_empty());
+    }
+
+    #[test]
+    fn the_tree_does_not_grow_with_what_has_been_forgotten() {
+        let mut random = fastrand::Rng::with_seed(6);
+        let keyframes = keyframes(&mut random);
+        let mut places = KeyframeDatabase::default();
+        // Ever new keyframes, the last three of which stay.
+        let mut most = 0;
+        for (k, features) in keyframes.iter().enumerate() {
+            places.insert(k, features);
+            k.checked_sub(3).into_iter().for_each(|old| places.remove(old, &keyframes[old]));
+            if k == KEYFRAMES / 3 {
+                most = places.nodes.len();
+            }
+        }
+        assert!(places.nodes.len() < 2 * most, "{} nodes after {most}", places.nodes.len());
+        assert_eq!(places.query(&keyframes[KEYFRAMES - 2])[0].keyframe, KEYFRAMES - 2);
+        (KEYFRAMES - 3..KEYFRAMES).for_each(|k| places.remove(k, &keyframes[k]));
+        assert!(matches!(&places.nodes[0], Node::Leaf(entries) if entries.capacity() == 0));
+        assert_eq!(places.nodes.len(), 1 + 2 * places.free.len());
+        places.insert(KEYFRAMES, &keyframes[0]);
+        assert_eq!(places.query(&keyframes[0])[0].keyframe, KEYFRAMES);
     }
 
     #[test]

@@ -6,16 +6,19 @@
 //! it sees, and on the culled keyframes that follow those it moves.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::sync::Arc;
 
 use nalgebra::{Point3, Vector3};
 
 use crate::geometry::Se3;
 use crate::tracking::TrackingConfig;
-use crate::tracking::features::frame_features::Feature;
-pub use crate::tracking::map::keyframe::{CulledKeyframe, Keyframe};
+use crate::tracking::features::frame_features::{Feature, FrameFeatures};
+use crate::tracking::map::attachment::CulledKeyframe;
+pub use crate::tracking::map::keyframe::Keyframe;
 use crate::tracking::map::keyframe_database::KeyframeDatabase;
 pub use crate::tracking::map::landmark::{Landmark, LandmarkState, Observation};
 use crate::tracking::map::tally::{distinct, tally};
+use crate::tracking::map::trim;
 
 /// Links that a keyframe keeps.
 const MOST_LINKS: usize = 5;
@@ -31,17 +34,17 @@ pub struct Map {
     pub landmarks: Vec<Landmark>,
     /// By which keyframes are recognised.
     pub database: KeyframeDatabase,
-    /// By keyframe; none is held by another culled one.
-    pub culled: BTreeMap<usize, CulledKeyframe>,
     /// The culled keyframes that each living one carries.
-    carried: BTreeMap<usize, Vec<usize>>,
+    pub(super) carried: BTreeMap<usize, Vec<CulledKeyframe>>,
+    /// What culled keyframes have.
+    pub(super) no_features: Arc<FrameFeatures>,
     /// Counts corrections of the whole map: what was computed before one does not fit what is after it.
     pub corrections: usize,
     /// First keyframes of submaps that have not joined another.
     pub roots: BTreeSet<usize>,
     /// Keyframes that have not been culled, and how many features they hold.
     pub living: BTreeSet<usize>,
-    features: usize,
+    pub(super) features: usize,
     /// Landmarks on probation and the keyframes that made them, oldest first.
     pub probation: VecDeque<(usize, usize)>,
     /// Landmarks that are no more, and the number of keyframes when they ended, oldest first: their places are used again.
@@ -107,17 +110,6 @@ impl Map {
         self.landmarks[landmark].in_anchor = (anchor.camera_from_world * position) / anchor.unit;
     }
 
-    /// Moves a keyframe, with what hangs on it.
-    pub fn set_pose(&mut self, keyframe: usize, mut camera_from_world: Se3) {
-        // The inverse of a rotation that is not quite one would double the error with each correction.
-        camera_from_world.rotation.renormalize();
-        self.keyframes[keyframe].camera_from_world = camera_from_world;
-        for culled in self.carried.get(&keyframe).into_iter().flatten() {
-            let pose = self.keyframes[keyframe].carry(&self.culled[culled].camera_from_parent);
-            self.keyframes[*culled].camera_from_world = pose;
-        }
-    }
-
     /// A landmark first seen by `observation`.
     pub fn add_landmark(&mut self, observation: Observation, position: Point3<f64>, config: &TrackingConfig) -> usize {
         let may_reuse = self.ended.front().is_some_and(|(_, at)| *at + REUSED_AFTER <= self.keyframes.len());
@@ -161,6 +153,7 @@ impl Map {
         self.keyframes[observation.keyframe].landmarks[observation.feature] = None;
         let observations = &mut self.landmarks[landmark].observations;
         observations.retain(|s| *s != observation);
+        trim(observations);
         match self.landmarks[landmark].observations.first() {
             Some(first) => self.hang_on(landmark, first.keyframe),
             None => self.end(landmark, LandmarkState::Removed),
@@ -270,31 +263,6 @@ impl Map {
         self.keyframes[keyframe].root == keyframe
     }
 
-    /// The keyframe itself if it lives, else the one that it goes with.
-    pub fn living(&self, keyframe: usize) -> usize {
-        self.culled.get(&keyframe).map_or(keyframe, |held| held.parent)
-    }
-
-    /// The keyframe and the culled ones that go with it.
-    pub fn with_carried(&self, keyframe: usize) -> impl Iterator<Item = usize> {
-        std::iter::once(keyframe).chain(self.carried.get(&keyframe).into_iter().flatten().copied())
-    }
-
-    /// Gives up a keyframe, which has no landmarks any more: it and what it carries is attached to another one.
-    pub fn attach(&mut self, keyframe: usize, parent: usize) {
-        let features = std::mem::take(&mut self.keyframes[keyframe].features);
-        self.keyframes[keyframe].links = Vec::new();
-        self.database.remove(keyframe, &features.features);
-        self.living.remove(&keyframe);
-        self.features -= features.len();
-        let carried = self.carried.remove(&keyframe).unwrap_or_default();
-        for moved in std::iter::once(keyframe).chain(carried) {
-            let camera_from_parent = self.keyframes[parent].relative(&self.keyframes[moved].camera_from_world);
-            self.culled.insert(moved, CulledKeyframe { parent, camera_from_parent });
-            self.carried.entry(parent).or_default().push(moved);
-        }
-    }
-
     /// Notes which older keyframes share most landmarks with a keyframe.
     pub fn refresh_links(&mut self, keyframe: usize) {
         let older = self.covisible(keyframe).into_iter().filter(|(other, _)| *other < keyframe);
@@ -319,10 +287,8 @@ impl Map {
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
-    use std::sync::Arc;
 
     use crate::tracking::features::descriptor::Descriptor;
-    use crate::tracking::features::frame_features::FrameFeatures;
     use crate::tracking::features::frame_features::tests::feature;
     use crate::tracking::solvers::residual::tests::PINHOLE;
 
@@ -364,6 +330,18 @@ pub(crate) mod tests {
     }
 
     #[test]
+    fn observations_that_are_gone_leave_no_memory_behind() {
+        let mut map = map();
+        let landmark = map.add_landmark(at(0, 1), Point3::new(0.0, 0.0, 2.0), &config());
+        (0..60).for_each(|_| _ = map.push(map.keyframes[0].clone()));
+        (3..60).for_each(|k| map.keyframes[k].landmarks = vec![None; 10]);
+        (3..60).for_each(|k| map.add_observation(landmark, at(k, 1)));
+        (4..60).for_each(|k| map.remove_observation(landmark, at(k, 1)));
+        let observations = &map.landmarks[landmark].observations;
+        assert!(observations[..] == [at(0, 1), at(3, 1)] && observations.capacity() <= 4, "{}", observations.capacity());
+    }
+
+    #[test]
     fn the_place_of_a_landmark_that_ended_is_used_again_when_nobody_names_it() {
         let mut map = map();
         let first = map.add_landmark(at(0, 1), Point3::new(0.0, 0.0, 2.0), &config());
@@ -376,24 +354,5 @@ pub(crate) mod tests {
         assert_eq!((third, map.landmarks.len()), (first, 2));
         assert!(map.is_alive_since(second, known) && !map.is_alive_since(third, known));
         assert_eq!(map.position(third), Point3::new(1.0, 0.0, 2.0));
-    }
-
-    #[test]
-    fn what_hangs_on_a_keyframe_goes_with_it() {
-        let mut map = map();
-        let id = map.add_landmark(at(1, 1), Point3::new(0.5, 0.0, 2.0), &config());
-        map.add_observation(id, at(2, 4));
-        map.keyframes[1].unit = 2.0;
-        map.set_position(id, &Point3::new(0.5, 0.0, 2.0));
-        map.keyframes[0].landmarks.clear();
-        map.attach(0, 1);
-        let push = Se3::translation(0.0, 0.3, 0.0);
-        map.set_pose(1, push);
-        assert!((map.position(id) - Point3::new(0.5, -0.3, 2.0)).norm() < 1e-12);
-        assert!((map.keyframes[0].centre() - map.keyframes[1].centre()).norm() < 1e-12 && map.living(0) == 1);
-        // Its next anchor takes it over where it is.
-        map.remove_observation(id, at(1, 1));
-        map.set_pose(1, Se3::identity());
-        assert!((map.position(id) - Point3::new(0.5, -0.3, 2.0)).norm() < 1e-12 && map.landmarks[id].anchor == 2);
     }
 }

@@ -131,7 +131,7 @@ impl Tracker {
             self.note_move(*keyframe, *growth);
         }
         self.follow_keyframe();
-        let living = moved.iter().map(|m| m.keyframe).filter(|k| !self.map.culled.contains_key(k));
+        let living = moved.iter().map(|m| m.keyframe).filter(|k| !self.map.is_culled(*k));
         self.closing.unsettled = living.step_by(WINDOW_EVERY).collect();
         self.begin_next_closing()
     }
@@ -154,7 +154,7 @@ impl Tracker {
             return self.give_closing(Job::Adjust(all, Extent::All), later);
         }
         while let Some(keyframe) = self.closing.unsettled.pop_front() {
-            let lives = !self.map.culled.contains_key(&keyframe);
+            let lives = !self.map.is_culled(keyframe);
             let window = lives.then(|| Adjustment::of_window(&self.map, keyframe, &self.rig)).flatten();
             if let Some(window) = window {
                 let later = 1 + window.problem.observations.len() / OBSERVATIONS_A_FRAME;

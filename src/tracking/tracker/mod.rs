@@ -259,7 +259,7 @@ impl Tracker {
 
     /// How many keyframes have not been culled.
     pub fn living_keyframes(&self) -> usize {
-        self.map.keyframes.len() - self.map.culled.len()
+        self.map.living.len()
     }
 
     /// The frame's pose, if it can be trusted.
