@@ -162,8 +162,9 @@ impl BundleProblem {
                 system.gradient_points[point] += weighted * residual;
                 let by_pose = (o.pose < bias).then(|| measurement.jacobian_by_pose(pinhole, &p_in_camera));
                 if let Some(by_pose) = &by_pose {
-                    let weighted = by_pose.transpose() * weights;
-                    system.hessian_blocks[o.pose] += weighted * by_pose;
+                    let pose_by = by_pose.transpose();
+                    let weighted = pose_by * weights;
+                    add_product(&mut system.hessian_blocks[o.pose], &weighted, &pose_by);
                     system.gradient_blocks[o.pose] += weighted * residual;
                     system.mixed.push(Mixed { point, block: o.pose, block_by_point: weighted * by_point });
                 }
@@ -252,10 +253,11 @@ fn solve_blocks(
         let Some(inverse) = &point_inverses[point] else { continue };
         for a in group {
             let gain = a.block_by_point * inverse;
+            let less = -gain;
             right[a.block] += gain * system.gradient_points[point];
             // The lower triangle is all that Cholesky reads.
             for b in group.iter().filter(|b| b.block <= a.block) {
-                blocks[reduced.place(a.block, b.block)] -= gain * b.block_by_point.transpose();
+                add_product(&mut blocks[reduced.place(a.block, b.block)], &less, &b.block_by_point);
             }
         }
     }
@@ -267,6 +269,15 @@ fn solve_blocks(
 /// The bias' three unknowns as a block of six; the others stay zero.
 fn padded(bias: &Vector3<f64>) -> Vector6<f64> {
     bias.fixed_resize::<6, 1>(0.0)
+}
+
+/// Adds `a·bᵀ` to a block. Written out, for it is most of the work.
+fn add_product(block: &mut Matrix6<f64>, a: &Matrix6x3<f64>, b: &Matrix6x3<f64>) {
+    for j in 0..6 {
+        for i in 0..6 {
+            block[(i, j)] += a[(i, 0)] * b[(j, 0)] + a[(i, 1)] * b[(j, 1)] + a[(i, 2)] * b[(j, 2)];
+        }
+    }
 }
 
 fn damped3(hessian: &Matrix3<f64>, lambda: f64) -> Matrix3<f64> {
