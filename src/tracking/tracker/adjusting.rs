@@ -91,14 +91,18 @@ impl Tracker {
         self.begin_next(times)
     }
 
-    /// Takes in what has been adjusted, if it is time for it.
-    pub(super) fn take_adjusted(&mut self, times: &mut StageTimes) -> Result<(), TrackingError> {
-        let Some(under_way) = self.adjusting.under_way else { return Ok(()) };
+    /// Takes in what has been adjusted, if it is time for it; `false` if it is not.
+    pub(super) fn take_adjusted(&mut self, times: &mut StageTimes) -> Result<bool, TrackingError> {
+        let Some(under_way) = self.adjusting.under_way else { return Ok(false) };
         if self.adjusting.real_time {
-            let solved = self.adjusting.worker.poll()?;
-            return solved.map_or(Ok(()), |solved| self.take_in(under_way, &solved, times));
+            let Some(solved) = self.adjusting.worker.poll()? else { return Ok(false) };
+            self.take_in(under_way, &solved, times)?;
+        } else if self.frames_seen >= under_way.due {
+            self.wait_for(under_way, times)?;
+        } else {
+            return Ok(false);
         }
-        if self.frames_seen >= under_way.due { self.wait_for(under_way, times) } else { Ok(()) }
+        Ok(true)
     }
 
     /// Takes in all that is under way, and what follows from it.

@@ -2,6 +2,7 @@
 //! all that it moved: at once where that is little, else window by window.
 //!
 //! As with bundle adjustment, deterministic replay takes a result in at a fixed frame, the later the larger it is, and real time when it is ready.
+//! A frame has one such task: what follows from a result begins a frame later, and both make way for a bundle adjustment that is taken in.
 
 use std::collections::VecDeque;
 use std::time::Instant;
@@ -25,6 +26,8 @@ pub(super) struct Closing {
     worker: Worker<Job>,
     /// Deterministic replay: the frame, counted from 1, at which the job under way is taken in.
     due: Option<usize>,
+    /// Without a job: the frame, counted from 1, at which the next is made.
+    next: usize,
     /// A correction is under way, or waits for the worker.
     correcting: bool,
     waiting: Option<Correction>,
@@ -52,7 +55,7 @@ impl Closing {
             Job::Adjust(adjustment, _) => adjustment.solve(&pinhole, steps),
         };
         let worker = Worker::start("closing", solve)?;
-        Ok(Self { worker, due: None, correcting: false, waiting: None, unsettled: VecDeque::new() })
+        Ok(Self { worker, due: None, next: 0, correcting: false, waiting: None, unsettled: VecDeque::new() })
     }
 }
 
@@ -66,11 +69,10 @@ impl Tracker {
         let recognised = self.loops.recognise(&mut self.map, keyframe, &self.rig);
         let found = recognised.is_some();
         match recognised {
-            Some(correction) if correction.is_solved() => self.take_correction(&correction)?,
+            Some(correction) if correction.is_solved() => self.take_correction(&correction),
             Some(correction) => {
                 self.closing.correcting = true;
                 self.closing.waiting = Some(correction);
-                self.begin_next_closing()?;
             }
             None => {}
         }
@@ -78,36 +80,40 @@ impl Tracker {
         Ok(found)
     }
 
-    /// Takes in what the thread has solved, if it is time for it.
-    pub(super) fn take_closed(&mut self, times: &mut StageTimes) -> Result<(), TrackingError> {
-        let Some(due) = self.closing.due else { return Ok(()) };
+    /// Takes in what the thread has solved, or gives it the next job, if it is time for it. `adjusted`: a bundle adjustment was taken in at
+    /// this frame.
+    pub(super) fn take_closed(&mut self, adjusted: bool, times: &mut StageTimes) -> Result<(), TrackingError> {
         let clock = Instant::now();
-        let solved = match self.adjusting.real_time {
-            true => self.closing.worker.poll()?,
-            false if self.frames_seen >= due => Some(self.closing.worker.wait()?),
-            false => None,
+        let now = self.frames_seen - usize::from(adjusted);
+        let solved = match self.closing.due {
+            None if now >= self.closing.next => return self.begin_next_closing(times),
+            Some(_) if self.adjusting.real_time => self.closing.worker.poll()?,
+            Some(due) if now >= due => Some(self.closing.worker.wait()?),
+            _ => None,
         };
-        solved.map_or(Ok(()), |job| self.take_job(job))?;
+        solved.into_iter().for_each(|job| self.take_job(job));
         times.loops_ms += milliseconds(clock);
         Ok(())
     }
 
-    /// Waits for the job under way; `false` if there is none.
+    /// Waits for the job under way, or the next; `false` if there is none.
     pub(super) fn wait_for_closing(&mut self) -> Result<bool, TrackingError> {
+        self.begin_next_closing(&mut StageTimes::default())?;
         if self.closing.due.is_none() {
             return Ok(false);
         }
         let job = self.closing.worker.wait()?;
-        self.take_job(job)?;
+        self.take_job(job);
         Ok(true)
     }
 
-    fn take_job(&mut self, job: Job) -> Result<(), TrackingError> {
+    fn take_job(&mut self, job: Job) {
         self.closing.due = None;
+        self.closing.next = self.frames_seen + 1;
         match job {
             Job::Correct(correction) => {
                 self.closing.correcting = false;
-                self.take_correction(&correction)?;
+                self.take_correction(&correction);
             }
             Job::Adjust(adjustment, extent) if adjustment.fits(&self.map) => {
                 adjustment.apply(&mut self.map, &self.rig.config).into_iter().for_each(|k| self.note_move(k, 1.0));
@@ -117,10 +123,9 @@ impl Tracker {
             }
             Job::Adjust(..) => {}
         }
-        self.begin_next_closing()
     }
 
-    fn take_correction(&mut self, correction: &Correction) -> Result<(), TrackingError> {
+    fn take_correction(&mut self, correction: &Correction) {
         let moved = self.loops.apply(correction, &mut self.map, &self.rig);
         for MovedKeyframe { keyframe, growth } in &moved {
             if *keyframe == self.motion.reference
@@ -133,40 +138,42 @@ impl Tracker {
         self.follow_keyframe();
         let living = moved.iter().map(|m| m.keyframe).filter(|k| !self.map.is_culled(*k));
         self.closing.unsettled = living.step_by(WINDOW_EVERY).collect();
-        self.begin_next_closing()
     }
 
     /// Gives the thread its next job: a correction, or bundle adjustment of what the last one moved.
-    fn begin_next_closing(&mut self) -> Result<(), TrackingError> {
-        if self.closing.due.is_some() {
-            return Ok(());
+    fn begin_next_closing(&mut self, times: &mut StageTimes) -> Result<(), TrackingError> {
+        let clock = Instant::now();
+        let next = if self.closing.due.is_none() { self.next_closing() } else { None };
+        if let Some((job, later)) = next {
+            self.closing.worker.give(job)?;
+            self.closing.due = Some(self.frames_seen + later);
         }
+        times.loops_ms += milliseconds(clock);
+        Ok(())
+    }
+
+    /// The next job, and how many frames the thread has for it.
+    fn next_closing(&mut self) -> Option<(Job, usize)> {
         if let Some(correction) = self.closing.waiting.take() {
             self.closing.unsettled.clear();
             let later = 1 + correction.size() / KEYFRAMES_A_FRAME;
-            return self.give_closing(Job::Correct(correction), later);
+            return Some((Job::Correct(correction), later));
         }
-        let Some(first) = self.closing.unsettled.front().copied() else { return Ok(()) };
+        let first = self.closing.unsettled.front().copied()?;
         let root = self.map.keyframes[first].root;
         if let Some(all) = Adjustment::of_all(&self.map, root, &self.rig) {
             self.closing.unsettled.clear();
             let later = 1 + all.problem.observations.len() / OBSERVATIONS_A_FRAME;
-            return self.give_closing(Job::Adjust(all, Extent::All), later);
+            return Some((Job::Adjust(all, Extent::All), later));
         }
         while let Some(keyframe) = self.closing.unsettled.pop_front() {
             let lives = !self.map.is_culled(keyframe);
             let window = lives.then(|| Adjustment::of_window(&self.map, keyframe, &self.rig)).flatten();
             if let Some(window) = window {
                 let later = 1 + window.problem.observations.len() / OBSERVATIONS_A_FRAME;
-                return self.give_closing(Job::Adjust(window, Extent::Window), later);
+                return Some((Job::Adjust(window, Extent::Window), later));
             }
         }
-        Ok(())
-    }
-
-    fn give_closing(&mut self, job: Job, later: usize) -> Result<(), TrackingError> {
-        self.closing.worker.give(job)?;
-        self.closing.due = Some(self.frames_seen + later);
-        Ok(())
+        None
     }
 }

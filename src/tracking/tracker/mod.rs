@@ -173,8 +173,8 @@ impl Tracker {
         self.frames_seen += 1;
         self.lostness.frames_lost += self.missing_before(frame);
         let mut times = StageTimes { features_ms: frame.features_ms, ..StageTimes::default() };
-        self.take_adjusted(&mut times)?;
-        self.take_closed(&mut times)?;
+        let adjusted = self.take_adjusted(&mut times)?;
+        self.take_closed(adjusted, &mut times)?;
         let mut tracked = match self.motion.last.take() {
             Some(last) => self.go_on(frame, last, may_be_keyframe, times)?,
             None if self.sensor == Sensor::Mono => self.start_without_depth(frame, may_be_keyframe, times),
