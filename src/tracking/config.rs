@@ -2,14 +2,14 @@
 
 use serde::{Deserialize, Serialize};
 
-const FEATURES: usize = 1000;
-const FEATURES_WITH_DEPTH_IMAGES: usize = 2000;
+use crate::sequence::SensorKind;
 
 /// Settings of the tracker.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TrackingConfig {
-    /// Features kept per frame, over all pyramid levels; by default 2000 with depth images and 1000 without.
+    /// Features kept per frame, over all pyramid levels; by default 2000 with depth images, 1500 of a single camera and 1000 of a
+    /// stereo pair.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub features: Option<usize>,
     /// Levels of the image pyramid.
@@ -91,9 +91,13 @@ impl Default for TrackingConfig {
 }
 
 impl TrackingConfig {
-    /// Features kept per frame of a sensor with depth images or without.
-    pub fn features_kept(&self, has_depth_images: bool) -> usize {
-        self.features.unwrap_or(if has_depth_images { FEATURES_WITH_DEPTH_IMAGES } else { FEATURES })
+    /// Features kept per frame of a sensor.
+    pub fn features_kept(&self, sensor: SensorKind) -> usize {
+        self.features.unwrap_or(match sensor {
+            SensorKind::Rgbd => 2000,
+            SensorKind::Mono => 1500,
+            SensorKind::Stereo => 1000,
+        })
     }
 
     /// Checks every value; the message names the field and what it may be.
@@ -110,7 +114,7 @@ impl TrackingConfig {
             let good = value > low && value <= high;
             if good { Ok(()) } else { Err(format!("tracking.{name} is {value}; it must be above {low} and at most {high}")) }
         };
-        let fewest = self.features_kept(false);
+        let fewest = self.features_kept(SensorKind::Stereo);
         count("features", fewest, 100, 20_000)?;
         count("pyramid_levels", self.pyramid_levels, 1, 16)?;
         number("pyramid_scale", self.pyramid_scale, 1.01, 2.0)?;

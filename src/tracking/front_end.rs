@@ -49,7 +49,7 @@ impl ExtractedFrame {
 impl FrontEnd {
     /// A front end for one camera; the settings are checked by [`Tracker::new`](crate::tracking::Tracker::new).
     pub fn new(camera: Camera, sensor: Sensor, config: &TrackingConfig) -> Self {
-        let features = config.features_kept(sensor == Sensor::Rgbd);
+        let features = config.features_kept(sensor.kind());
         Self {
             extractor: Extractor::new(camera.pinhole.width, camera.pinhole.height, features, config),
             sampler: (sensor == Sensor::Rgbd).then(|| DenseSampler::new(&camera)),

@@ -12,7 +12,7 @@ use crate::geometry::Se3;
 use crate::mapping::MappingConfig;
 use crate::pipeline::{PipelineError, Progress};
 use crate::recording::Recording;
-use crate::sequence::{Frame, FrameEntry, KnownPoint, Sensor, SequenceError};
+use crate::sequence::{Frame, FrameEntry, KnownPoint, Sensor, SensorKind, SequenceError};
 use crate::splat::ViewCamera;
 use crate::tracking::TrackingConfig;
 use crate::tracking::structure::{PosedView, SeenPoint, triangulate_views};
@@ -140,7 +140,7 @@ fn triangulate(recording: &Recording, progress: &Progress) -> Result<BTreeMap<us
     frames.retain(|(index, _)| !config.replay.is_held_out(*index));
     let frames: Vec<(usize, Se3)> = frames.iter().step_by(frames.len().div_ceil(MOST_VIEWS).max(1)).copied().collect();
     let tracking = TrackingConfig {
-        features: Some(config.tracking.features_kept(false).max(FEATURES)),
+        features: Some(config.tracking.features_kept(SensorKind::Mono).max(FEATURES)),
         pixel_sigma: PIXEL_SIGMA_SHARE * config.tracking.pixel_sigma,
         ..config.tracking.clone()
     };

@@ -33,9 +33,10 @@ pub struct FrameFeatures {
     pub features: Vec<Feature>,
     columns: usize,
     rows: usize,
-    /// `cells[c]..cells[c + 1]` are the places in `order` of cell `c`'s features.
+    /// `cells[c]..cells[c + 1]` are the places in `by_cell` of cell `c`'s features.
     cells: Vec<u32>,
-    order: Vec<u32>,
+    /// Pixels and indices: a search reads them in a row.
+    by_cell: Vec<(Vector2<f64>, u32)>,
 }
 
 impl FrameFeatures {
@@ -45,18 +46,18 @@ impl FrameFeatures {
         features.shrink_to_fit();
         let columns = (f64::from(pinhole.width) / CELL_PIXELS).ceil().max(1.0) as usize;
         let rows = (f64::from(pinhole.height) / CELL_PIXELS).ceil().max(1.0) as usize;
-        let cell_of = |f: &Feature| cell(f.pixel.y, rows) * columns + cell(f.pixel.x, columns);
-        let mut order: Vec<u32> = (0..features.len() as u32).collect();
+        let cell_of = |pixel: &Vector2<f64>| cell(pixel.y, rows) * columns + cell(pixel.x, columns);
+        let mut by_cell: Vec<(Vector2<f64>, u32)> = features.iter().map(|f| f.pixel).zip(0..).collect();
         // Stable: features of one cell stay in their order.
-        order.sort_by_key(|i| cell_of(&features[*i as usize]));
+        by_cell.sort_by_key(|(pixel, _)| cell_of(pixel));
         let mut cells = vec![0u32; columns * rows + 1];
         for feature in &features {
-            cells[cell_of(feature) + 1] += 1;
+            cells[cell_of(&feature.pixel) + 1] += 1;
         }
         for c in 1..cells.len() {
             cells[c] += cells[c - 1];
         }
-        Self { features, columns, rows, cells, order }
+        Self { features, columns, rows, cells, by_cell }
     }
 
     pub fn len(&self) -> usize {
@@ -69,8 +70,8 @@ impl FrameFeatures {
         let (y0, y1) = (cell(centre.y - radius, self.rows), cell(centre.y + radius, self.rows));
         for y in y0..=y1 {
             let span = self.cells[y * self.columns + x0] as usize..self.cells[y * self.columns + x1 + 1] as usize;
-            for index in &self.order[span] {
-                if (self.features[*index as usize].pixel - centre).norm_squared() <= radius * radius {
+            for (pixel, index) in &self.by_cell[span] {
+                if (pixel - centre).norm_squared() <= radius * radius {
                     visit(*index as usize);
                 }
             }

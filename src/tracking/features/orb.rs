@@ -19,6 +19,7 @@ use crate::tracking::{TrackingConfig, TrackingError};
 const BORDER: i32 = 16;
 /// Radius of the orientation patch, pixels.
 const PATCH_RADIUS: i32 = 15;
+const PATCH_COLUMNS: usize = 2 * PATCH_RADIUS as usize + 2;
 /// Side of the squares that are searched again with the lower threshold if they have no corner, pixels.
 const TEXTURE_CELL: i32 = 32;
 /// FAST looks this far around a pixel.
@@ -61,8 +62,17 @@ pub struct Extractor {
     levels: Vec<Level>,
     threshold: i32,
     threshold_low: i32,
-    /// Half width of each row of the round orientation patch, rows `0..=PATCH_RADIUS`.
-    patch_rows: Vec<i32>,
+    /// Rows `0..=PATCH_RADIUS` of the round orientation patch.
+    patch_rows: Vec<PatchRow>,
+}
+
+/// A row of the orientation patch, as wide as the widest and a column more, which makes whole vectors.
+#[derive(Clone, Debug)]
+struct PatchRow {
+    /// 1 inside the round patch, 0 outside.
+    inside: [i16; PATCH_COLUMNS],
+    /// The distance from the corner's column inside, 0 outside.
+    column: [i16; PATCH_COLUMNS],
 }
 
 #[derive(Clone, Debug)]
@@ -85,7 +95,13 @@ impl Extractor {
             .take_while(|level| level.size.width > 2 * BORDER + 8 && level.size.height > 2 * BORDER + 8)
             .collect();
         let radius = f64::from(PATCH_RADIUS) + 0.5;
-        let patch_rows = (0..=PATCH_RADIUS).map(|v| (radius * radius - f64::from(v * v)).sqrt() as i32).collect();
+        let patch_row = |v: i32| {
+            let half = (radius * radius - f64::from(v * v)).sqrt() as i16;
+            let column: [i16; PATCH_COLUMNS] = std::array::from_fn(|k| k as i16 - PATCH_RADIUS as i16);
+            let inside = column.map(|c| i16::from(c.abs() <= half));
+            PatchRow { inside, column: std::array::from_fn(|k| inside[k] * column[k]) }
+        };
+        let patch_rows = (0..=PATCH_RADIUS).map(patch_row).collect();
         Self {
             levels,
             threshold: config.fast_threshold.into(),
@@ -180,12 +196,12 @@ impl Extractor {
     fn orientation(&self, pixels: &[u8], width: i32, corner: &Corner) -> f32 {
         let (mut m10, mut m01) = (0i64, 0i64);
         for v in -PATCH_RADIUS..=PATCH_RADIUS {
-            let half = self.patch_rows[v.unsigned_abs() as usize];
-            let start = ((corner.y + v) * width + corner.x - half) as usize;
+            let row = &self.patch_rows[v.unsigned_abs() as usize];
+            let start = ((corner.y + v) * width + corner.x - PATCH_RADIUS) as usize;
             let (mut row_sum, mut row_moment) = (0i32, 0i32);
-            for (k, value) in pixels[start..=start + 2 * half as usize].iter().enumerate() {
-                row_sum += i32::from(*value);
-                row_moment += (k as i32 - half) * i32::from(*value);
+            for ((value, inside), column) in pixels[start..start + PATCH_COLUMNS].iter().zip(&row.inside).zip(&row.column) {
+                row_sum += i32::from(*value) * i32::from(*inside);
+                row_moment += i32::from(*value) * i32::from(*column);
             }
             m10 += i64::from(row_moment);
             m01 += i64::from(v * row_sum);

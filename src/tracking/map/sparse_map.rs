@@ -25,7 +25,7 @@ const MOST_LINKS: usize = 5;
 /// Keyframes after the end of a landmark until its place is used again.
 const REUSED_AFTER: usize = 2;
 /// Host memory of a keyframe's feature: itself, its place in the grid, the landmark that it shows, the observation, its entry in the database.
-const BYTES_PER_FEATURE: usize = size_of::<Feature>() + 8 + size_of::<Option<usize>>() + 2 * size_of::<Observation>() + 48;
+const BYTES_PER_FEATURE: usize = size_of::<Feature>() + 24 + size_of::<Option<usize>>() + 2 * size_of::<Observation>() + 48;
 const BYTES_PER_LANDMARK: usize = size_of::<Landmark>();
 
 #[derive(Clone, Debug, Default)]
