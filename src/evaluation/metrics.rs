@@ -7,7 +7,6 @@ use std::fmt;
 use std::path::Path;
 
 use crate::sequence::SensorKind;
-use crate::tracking::DepthBias;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
@@ -88,13 +87,6 @@ pub struct DepthBiasFigures {
     pub tilt_x_per_m: f64,
     /// Along its columns.
     pub tilt_y_per_m: f64,
-}
-
-impl DepthBiasFigures {
-    /// The figures of a tracker's estimate.
-    pub fn of(DepthBias(bias): DepthBias) -> Self {
-        Self { offset_per_m: bias.x, tilt_x_per_m: bias.y, tilt_y_per_m: bias.z }
-    }
 }
 
 /// Absolute trajectory error, each aligned over its own poses.

@@ -21,6 +21,7 @@ use crate::geometry::{Se3, Trajectory};
 use crate::gpu::{Gpu, GpuError};
 use crate::recording::Recording;
 use crate::splat::GaussianCloud;
+use crate::tracking::DepthBias;
 
 /// Poses of all tracked frames, TUM format.
 pub const TRAJECTORY: &str = "trajectory.txt";
@@ -352,7 +353,11 @@ pub fn write_metrics(
         wall_s: Some(result.wall_s),
         resumed: result.resumed,
         tracking_ms: Times::of(&result.tracking_ms),
-        depth_bias: result.depth_bias.map(DepthBiasFigures::of),
+        depth_bias: result.depth_bias.map(|DepthBias(bias)| DepthBiasFigures {
+            offset_per_m: bias.x,
+            tilt_x_per_m: bias.y,
+            tilt_y_per_m: bias.z,
+        }),
         mapping: Some(MappingFigures {
             iterations,
             iterations_per_frame: iterations as f64 / frames.max(1) as f64,

@@ -293,6 +293,33 @@ fn depth_may_be_missing_or_wrong_but_not_at_the_start() {
 }
 
 #[test]
+fn a_tilt_of_the_measured_depth_is_found() {
+    const TILT: f64 = 0.015;
+    let tilted = |index: usize| {
+        let mut frame = render(index, &truth(index));
+        let depth = frame.depth.as_mut().unwrap();
+        for (k, metres) in depth.metres.iter_mut().enumerate() {
+            let x = (f64::from(k as u32 % depth.width) - CAMERA.pinhole.cx) / (0.5 * f64::from(depth.width));
+            *metres = (1.0 / (1.0 / f64::from(*metres) + TILT * x)) as f32;
+        }
+        frame
+    };
+    let frames: Vec<Frame> = (0..40).map(tilted).collect();
+    let with = |depth_bias| {
+        let config = TrackingConfig { features: Some(500), depth_bias, ..Default::default() };
+        run(Tracker::new(CAMERA, Sensor::Rgbd, &config).unwrap(), &frames).0
+    };
+    let (aware, unaware) = (with(true), with(false));
+    let found = aware.depth_bias().unwrap().0;
+    assert!((found.y - TILT).abs() < 0.3 * TILT && found.x.abs() < 0.2 * TILT && found.z.abs() < 0.3 * TILT, "{found:?}");
+    assert_eq!(unaware.depth_bias(), None);
+    let worst =
+        |tracker: &Tracker| tracker.trajectory().iter().map(|(i, pose)| error(&pose.world_from_camera, *i).0).fold(0.0, f64::max);
+    let (aware, unaware) = (worst(&aware), worst(&unaware));
+    assert!(aware < 0.6 * unaware, "{aware} {unaware}");
+}
+
+#[test]
 fn unusable_input_is_refused_in_words() {
     let bad = TrackingConfig { features: Some(0), ..Default::default() };
     assert!(Tracker::new(CAMERA, Sensor::Rgbd, &bad).unwrap_err().to_string().contains("tracking.features"));

@@ -35,6 +35,8 @@ pub(super) struct Adjusting {
     overtaken: Vec<usize>,
     /// Where thinning goes on.
     thinned: usize,
+    /// Frames seen when the whole map was adjusted last.
+    all_adjusted_at: usize,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -63,12 +65,13 @@ impl Adjusting {
             waiting: None,
             overtaken: Vec::new(),
             thinned: 0,
+            all_adjusted_at: 0,
         }
     }
 }
 
 impl Tracker {
-    /// Waits for all that is under way and takes it in: to be called when no frame is left. Returns the keyframes that moved since the
+    /// Waits for all that is under way, takes it in, and adjusts the map as a whole: to be called when no frame is left. Returns the keyframes that moved since the
     /// last frame.
     ///
     /// # Errors
@@ -77,9 +80,23 @@ impl Tracker {
         loop {
             self.take_all_adjusted(&mut StageTimes::default())?;
             if !self.wait_for_closing()? && self.adjusting.under_way.is_none() {
-                return Ok(self.updates());
+                break;
             }
         }
+        self.adjust_all();
+        Ok(self.updates())
+    }
+
+    /// Adjusts the whole submap of the trajectory once more, unless it is too large: what each window found reaches all others.
+    fn adjust_all(&mut self) {
+        if std::mem::replace(&mut self.adjusting.all_adjusted_at, self.frames_seen) == self.frames_seen {
+            return;
+        }
+        let all = Adjustment::of_all(&self.map, self.largest_submap(), &self.rig);
+        let Some(mut all) = all.map(|a| if self.seeks_bias() { a.with_bias(&self.rig) } else { a }) else { return };
+        all.solve(&self.rig.pinhole, self.rig.config.bundle_iterations);
+        self.rig.depth_bias = all.bias().unwrap_or(self.rig.depth_bias);
+        all.apply(&mut self.map, &self.rig.config).into_iter().for_each(|k| self.note_move(k, 1.0));
     }
 
     /// Has the surroundings of a new keyframe adjusted, now or when the worker is free.
@@ -136,7 +153,7 @@ impl Tracker {
         solved.apply(&mut self.map, &self.rig.config).into_iter().for_each(|k| self.note_move(k, 1.0));
         self.rig.depth_bias = solved.bias().unwrap_or(self.rig.depth_bias);
         times.bundle_ms += milliseconds(clock);
-        self.close_loops_and_cull(under_way.around, times)?;
+        self.close_loops_and_cull(under_way.around, times);
         self.follow_keyframe();
         self.begin_next(times)
     }
@@ -152,10 +169,11 @@ impl Tracker {
         let window = held.then(|| Adjustment::of_window(&self.map, keyframe, &self.rig)).flatten();
         let window = window.map(|w| if self.seeks_bias() { w.with_bias(&self.rig) } else { w });
         times.bundle_ms += milliseconds(clock);
-        match window {
-            Some(window) => self.begin(window, keyframe),
-            None => self.close_loops_and_cull(keyframe, times),
+        if let Some(window) = window {
+            return self.begin(window, keyframe);
         }
+        self.close_loops_and_cull(keyframe, times);
+        Ok(())
     }
 
     /// Rectified pairs are calibrated together, and a camera that drives forwards hardly shows a bias: depth images only.
@@ -173,13 +191,13 @@ impl Tracker {
 
     /// Runs after a keyframe's local bundle adjustment: a loop may be found, at it or at keyframes that it has overtaken, or some keyframes may
     /// have become redundant.
-    fn close_loops_and_cull(&mut self, keyframe: usize, times: &mut StageTimes) -> Result<(), TrackingError> {
+    fn close_loops_and_cull(&mut self, keyframe: usize, times: &mut StageTimes) {
         self.refresh_links(keyframe);
         let mut closed = false;
         let mut keyframes = std::mem::take(&mut self.adjusting.overtaken);
         keyframes.push(keyframe);
         for keyframe in &keyframes {
-            closed = closed || self.look_for_loop(*keyframe, times)?;
+            closed = closed || self.look_for_loop(*keyframe, times);
         }
         let clock = Instant::now();
         if !closed && self.rig.config.keyframe_culling {
@@ -192,7 +210,6 @@ impl Tracker {
         }
         self.motion.reference = self.map.living(self.motion.reference);
         times.mapping_ms += milliseconds(clock);
-        Ok(())
     }
 
     /// Bundle adjustment has changed what a keyframe and its neighbours share.
@@ -252,7 +269,7 @@ mod tests {
             (0..=newest).map(|k| seen(k).map(|l| (l, depth(k, l))).collect()).collect()
         };
         let before = depths(&tracker);
-        assert!(tracker.look_for_loop(newest, &mut StageTimes::default()).unwrap());
+        assert!(tracker.look_for_loop(newest, &mut StageTimes::default()));
         assert!(tracker.wait_for_closing().unwrap());
         tracker.note_move(3, 2.0);
         let after = depths(&tracker);

@@ -61,9 +61,9 @@ impl Closing {
 
 impl Tracker {
     /// Looks for a loop at a keyframe; `false` if there was none. One of two submaps joins them at once, any other is corrected beside tracking.
-    pub(super) fn look_for_loop(&mut self, keyframe: usize, times: &mut StageTimes) -> Result<bool, TrackingError> {
+    pub(super) fn look_for_loop(&mut self, keyframe: usize, times: &mut StageTimes) -> bool {
         if !self.rig.config.loop_closing || self.closing.correcting {
-            return Ok(false);
+            return false;
         }
         let clock = Instant::now();
         let recognised = self.loops.recognise(&mut self.map, keyframe, &self.rig);
@@ -77,7 +77,7 @@ impl Tracker {
             None => {}
         }
         times.loops_ms += milliseconds(clock);
-        Ok(found)
+        found
     }
 
     /// Takes in what the thread has solved, or gives it the next job, if it is time for it. `adjusted`: a bundle adjustment was taken in at
