@@ -125,6 +125,7 @@ impl TrackThread<'_> {
             Err(error) => return TrackSummary { error: Some(error.into()), ..summary },
         };
         let rectifier = Rectifier::new(&sequence.camera, config.map_scale);
+        let mut whole = true;
         let mut keyframes = KeyframeSender::new(self.mapper, config.replay.real_time);
         for QueuedFrame { frame, extracted } in self.frames {
             let Some(extracted) = extracted else { continue };
@@ -133,6 +134,7 @@ impl TrackThread<'_> {
                 Ok(tracked) => tracked,
                 Err(error) => {
                     summary.error = Some(error);
+                    whole = false;
                     break;
                 }
             };
@@ -141,14 +143,16 @@ impl TrackThread<'_> {
             let progress = TrackingProgress { frames_done: frame.index + 1, keyframes: tracker.keyframe_count(), lost };
             self.progress.tracking.force_push(progress);
             if !keyframes.retry() || !self.send(&mut keyframes, &rectifier, &frame, tracked) {
+                whole = false;
                 break;
             }
         }
         // The adjustment in flight.
-        let adjusted = guarded("tracking", || Ok(tracker.finish()?)).unwrap_or_else(|error| {
-            summary.error.get_or_insert(error);
-            Vec::new()
-        });
+        let adjusted =
+            guarded("tracking", || Ok(if whole { tracker.finish()? } else { tracker.break_off()? })).unwrap_or_else(|error| {
+                summary.error.get_or_insert(error);
+                Vec::new()
+            });
         summary.trajectory = tracker.trajectory();
         summary.keyframes = tracker.keyframes();
         summary.depth_bias = tracker.depth_bias();

@@ -4,6 +4,10 @@ use serde::{Deserialize, Serialize};
 
 use crate::sequence::SensorKind;
 
+const FEATURES_RGBD: usize = 2000;
+const FEATURES_MONO: usize = 1500;
+const FEATURES_STEREO: usize = 1000;
+
 /// Settings of the tracker.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -94,9 +98,9 @@ impl TrackingConfig {
     /// Features kept per frame of a sensor.
     pub fn features_kept(&self, sensor: SensorKind) -> usize {
         self.features.unwrap_or(match sensor {
-            SensorKind::Rgbd => 2000,
-            SensorKind::Mono => 1500,
-            SensorKind::Stereo => 1000,
+            SensorKind::Rgbd => FEATURES_RGBD,
+            SensorKind::Mono => FEATURES_MONO,
+            SensorKind::Stereo => FEATURES_STEREO,
         })
     }
 

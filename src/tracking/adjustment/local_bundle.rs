@@ -28,6 +28,8 @@ pub struct Adjustment {
     pub problem: BundleProblem,
     /// The keyframe of each pose.
     keyframes: Vec<usize>,
+    /// Keyframes beside these that go rigidly with the one that they share most landmarks with.
+    carried: Vec<usize>,
     /// The landmark of each point.
     landmarks: Vec<usize>,
     /// The observation of each observation.
@@ -44,17 +46,19 @@ impl Adjustment {
         Self::new(map, &free, &fixed, rig)
     }
 
-    /// Global bundle adjustment of the submap that begins with `root`; `None` if it is too large for one adjustment.
+    /// Global bundle adjustment of the submap that begins with `root`; `None` if it is too large for one adjustment. Few landmarks would tear a
+    /// keyframe from where all pixels put it: such a keyframe is carried.
     pub fn of_all(map: &Map, root: usize, rig: &Rig) -> Option<Self> {
-        let free: Vec<usize> = map.living_in(root).filter(|k| *k != root).collect();
         let mut observations = 0;
-        for keyframe in &free {
-            observations += map.keyframes[*keyframe].landmarks.iter().flatten().count();
+        for keyframe in map.living_in(root) {
+            observations += map.keyframes[keyframe].landmarks.iter().flatten().count();
             if observations > MOST_OBSERVATIONS {
                 return None;
             }
         }
-        Self::new(map, &free, &[root], rig)
+        let is_held = |k: &usize| map.covisible(*k).first().is_some_and(|(_, shared)| *shared >= MIN_SHARED);
+        let (free, carried): (Vec<usize>, Vec<usize>) = map.living_in(root).filter(|k| *k != root).partition(is_held);
+        Some(Self { carried, ..Self::new(map, &free, &[root], rig)? })
     }
 
     /// Bundle adjustment of the keyframes `free` and all their landmarks, with `fixed` held constant.
@@ -66,7 +70,8 @@ impl Adjustment {
         landmarks.retain(|l| map.landmarks[*l].observations.len() > 1);
         let keyframes: Vec<usize> = free.iter().chain(fixed).copied().collect();
         let (problem, observations) = make_problem(map, &keyframes, free.len(), &landmarks, rig);
-        Some(Self { problem, keyframes, landmarks, observations, known: map.keyframes.len(), corrections: map.corrections })
+        let (known, corrections) = (map.keyframes.len(), map.corrections);
+        Some(Self { problem, keyframes, carried: Vec::new(), landmarks, observations, known, corrections })
     }
 
     /// With the bias of a depth sensor among the unknowns, near what it was found to be before.
@@ -94,8 +99,8 @@ impl Adjustment {
         self.corrections == map.corrections
     }
 
-    /// Takes the result into the map; returns the keyframes that may have moved, in ascending order. Keyframes that came since go
-    /// rigidly with the one that they share most with. What hangs on a keyframe goes with it.
+    /// Takes the result into the map; returns the keyframes that may have moved, in ascending order. Those that came since go
+    /// rigidly with the one that they share most with, as do those that were left out. What hangs on a keyframe goes with it.
     pub fn apply(&self, map: &mut Map, config: &TrackingConfig) -> Vec<usize> {
         let free = &self.keyframes[..self.problem.free_poses];
         let mut before: BTreeMap<usize, Se3> = BTreeMap::new();
@@ -106,12 +111,12 @@ impl Adjustment {
             before.insert(*k, map.keyframes[*k].camera_from_world);
             map.set_pose(*k, *pose);
         }
-        for newer in self.known..map.keyframes.len() {
-            let Some((neighbour, _)) = map.covisible(newer).into_iter().find(|(k, _)| before.contains_key(k)) else { continue };
-            let pose = map.keyframes[newer].camera_from_world;
-            let newer_from_neighbour = pose * before[&neighbour].inverse();
-            before.insert(newer, pose);
-            map.set_pose(newer, newer_from_neighbour * map.keyframes[neighbour].camera_from_world);
+        for other in self.carried.iter().copied().chain(self.known..map.keyframes.len()) {
+            let Some((neighbour, _)) = map.covisible(other).into_iter().find(|(k, _)| before.contains_key(k)) else { continue };
+            let pose = map.keyframes[other].camera_from_world;
+            let other_from_neighbour = pose * before[&neighbour].inverse();
+            before.insert(other, pose);
+            map.set_pose(other, other_from_neighbour * map.keyframes[neighbour].camera_from_world);
         }
         for (l, point) in self.landmarks.iter().zip(&self.problem.points) {
             if map.is_alive_since(*l, self.known) {

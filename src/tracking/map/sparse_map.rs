@@ -54,6 +54,7 @@ pub struct Map {
 impl Map {
     /// Takes in another map's keyframes and landmarks; nothing connects them with those that are here.
     pub fn append(&mut self, other: Self, world_from_other: &Se3, config: &TrackingConfig) {
+        debug_assert!(other.carried.is_empty(), "maps are appended before anything is culled");
         let (keyframes, landmarks) = (self.keyframes.len(), self.landmarks.len());
         let other_from_world = world_from_other.inverse();
         for mut keyframe in other.keyframes {

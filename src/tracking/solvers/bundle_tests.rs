@@ -95,6 +95,25 @@ fn a_bias_of_the_depth_is_found() {
 }
 
 #[test]
+fn the_gradient_by_the_bias_is_the_numerical_derivative_of_the_cost() {
+    let (mut problem, _) = scene(0.5, false);
+    problem.depth_bias = DepthBias(Vector3::new(0.002, -0.005, 0.004));
+    problem.bias_prior = Some(BiasPrior::after(&DepthBias(Vector3::new(0.001, 0.002, 0.003)), 0.02));
+    let gradient = problem.linearise(&PINHOLE).gradient_blocks[problem.free_poses];
+    for k in 0..3 {
+        const STEP: f64 = 1e-6;
+        let cost = |sign: f64| {
+            let mut moved = problem.clone();
+            moved.depth_bias.0[k] += sign * STEP;
+            moved.cost(&PINHOLE)
+        };
+        let numeric = (cost(1.0) - cost(-1.0)) / (2.0 * STEP);
+        // The gradient leaves out the factor of two.
+        assert!((numeric - 2.0 * gradient[k]).abs() < 1e-4 * (1.0 + numeric.abs()), "{k}: {numeric} {}", gradient[k]);
+    }
+}
+
+#[test]
 fn the_reduced_system_steps_as_the_full_one_does() {
     for bias_prior in [None, Some(BiasPrior::after(&DepthBias(Vector3::new(0.001, -0.002, 0.003)), 0.02))] {
         compare_with_the_full_system(bias_prior);

@@ -50,8 +50,9 @@ pub fn optimise_pose(pinhole: &Pinhole, initial: &Se3, observations: &[PoseObser
                 inliers: 0,
             };
         }
-        let converged = if round + 1 == ROUNDS { CONVERGED } else { NEARLY_CONVERGED };
-        pose = refine(pinhole, &pose, observations, &classes, (round < ROBUST_ROUNDS, converged));
+        let round =
+            Round { robust: round < ROBUST_ROUNDS, converged: if round + 1 == ROUNDS { CONVERGED } else { NEARLY_CONVERGED } };
+        pose = refine(pinhole, &pose, observations, &classes, &round);
         for (t, o) in classes.iter_mut().zip(observations) {
             *t = o.measurement.classify(pinhole, &(pose * o.point_in_world).coords);
         }
@@ -60,17 +61,19 @@ pub fn optimise_pose(pinhole: &Pinhole, initial: &Se3, observations: &[PoseObser
     PoseEstimate { camera_from_world: pose, classes, inliers }
 }
 
-/// Levenberg-Marquardt over the trusted observations, with Huber's kernel if `robust`, until a step is below `converged`.
-fn refine(
-    pinhole: &Pinhole,
-    initial: &Se3,
-    observations: &[PoseObservation],
-    classes: &[InlierClass],
-    (robust, converged): (bool, f64),
-) -> Se3 {
+/// How one round is solved.
+struct Round {
+    /// With Huber's kernel.
+    robust: bool,
+    /// The step below which it ends.
+    converged: f64,
+}
+
+/// Levenberg-Marquardt over the trusted observations.
+fn refine(pinhole: &Pinhole, initial: &Se3, observations: &[PoseObservation], classes: &[InlierClass], round: &Round) -> Se3 {
     let mut pose = *initial;
     let mut lambda = 1e-4;
-    let (mut hessian, mut gradient, mut cost) = linearise(pinhole, &pose, observations, classes, robust);
+    let (mut hessian, mut gradient, mut cost) = linearise(pinhole, &pose, observations, classes, round.robust);
     for _ in 0..STEPS_PER_ROUND {
         let mut damped = hessian;
         for k in 0..6 {
@@ -78,14 +81,14 @@ fn refine(
         }
         let Some(step) = damped.cholesky().map(|c| c.solve(&-gradient)) else { break };
         let candidate = se3::exp(&step) * pose;
-        let (h, g, candidate_cost) = linearise(pinhole, &candidate, observations, classes, robust);
+        let (h, g, candidate_cost) = linearise(pinhole, &candidate, observations, classes, round.robust);
         if candidate_cost < cost {
             (pose, hessian, gradient, cost) = (candidate, h, g, candidate_cost);
             lambda *= 0.1;
         } else {
             lambda *= 10.0;
         }
-        if step.norm() < converged {
+        if step.norm() < round.converged {
             break;
         }
     }

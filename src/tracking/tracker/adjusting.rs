@@ -71,20 +71,33 @@ impl Adjusting {
 }
 
 impl Tracker {
-    /// Waits for all that is under way, takes it in, and adjusts the map as a whole: to be called when no frame is left. Returns the keyframes that moved since the
-    /// last frame.
+    /// To be called when no frame is left: waits for all that is under way, takes it in, and adjusts the trajectory's submap as a whole. Returns
+    /// the keyframes that moved since the last frame.
     ///
     /// # Errors
     /// [`TrackingError::Adjusting`] if the adjustment panicked.
     pub fn finish(&mut self) -> Result<Vec<KeyframeUpdate>, TrackingError> {
+        self.take_in_all()?;
+        self.adjust_all();
+        Ok(self.updates())
+    }
+
+    /// As [`Self::finish`] without the last adjustment: after an error.
+    ///
+    /// # Errors
+    /// Those of [`Self::finish`].
+    pub fn break_off(&mut self) -> Result<Vec<KeyframeUpdate>, TrackingError> {
+        self.take_in_all()?;
+        Ok(self.updates())
+    }
+
+    fn take_in_all(&mut self) -> Result<(), TrackingError> {
         loop {
             self.take_all_adjusted(&mut StageTimes::default())?;
             if !self.wait_for_closing()? && self.adjusting.under_way.is_none() {
-                break;
+                return Ok(());
             }
         }
-        self.adjust_all();
-        Ok(self.updates())
     }
 
     /// Adjusts the whole submap of the trajectory once more, unless it is too large: what each window found reaches all others.
@@ -97,6 +110,7 @@ impl Tracker {
         all.solve(&self.rig.pinhole, self.rig.config.bundle_iterations);
         self.rig.depth_bias = all.bias().unwrap_or(self.rig.depth_bias);
         all.apply(&mut self.map, &self.rig.config).into_iter().for_each(|k| self.note_move(k, 1.0));
+        self.follow_keyframe();
     }
 
     /// Has the surroundings of a new keyframe adjusted, now or when the worker is free.
@@ -248,10 +262,35 @@ impl Tracker {
 mod tests {
     use super::*;
     use crate::geometry::sim3::{self, Vector7};
-    use crate::geometry::{Camera, Distortion};
+    use crate::geometry::{Camera, Distortion, Se3, Sim3, se3};
     use crate::tracking::TrackingConfig;
     use crate::tracking::loop_closing::tests::drifted;
     use crate::tracking::solvers::residual::tests::PINHOLE;
+    use nalgebra::Vector6;
+
+    #[test]
+    fn the_end_adjusts_all_keyframes_together() {
+        let config = TrackingConfig::default();
+        let camera = Camera { pinhole: PINHOLE, distortion: Distortion::default(), depth_units_per_metre: 5000.0 };
+        let mut tracker = Tracker::new(camera, Sensor::Rgbd, &config).unwrap();
+        tracker.map = drifted(&Sim3::identity(), true, &config);
+        tracker.frames_seen = 1;
+        let truth: Vec<Se3> = tracker.map.keyframes.iter().map(|k| k.camera_from_world).collect();
+        for (k, pose) in truth.iter().enumerate().skip(1) {
+            let side = if k % 2 == 0 { 1.0 } else { -1.0 };
+            tracker.map.set_pose(k, se3::exp(&(Vector6::new(0.01, -0.005, 0.01, 0.003, 0.002, -0.004) * side)) * pose);
+        }
+        let worst = |tracker: &Tracker| {
+            let off =
+                tracker.map.keyframes.iter().zip(&truth).map(|(k, t)| se3::log(&(k.camera_from_world * t.inverse())).norm());
+            off.fold(0.0, f64::max)
+        };
+        let before = worst(&tracker);
+        let updates = tracker.finish().unwrap();
+        assert!(worst(&tracker) < 0.2 * before, "{before} {}", worst(&tracker));
+        assert_eq!(updates.len(), truth.len() - 1);
+        assert!(tracker.finish().unwrap().is_empty());
+    }
 
     #[test]
     fn the_scale_of_a_loop_without_depth_goes_out_with_the_poses() {

@@ -2,7 +2,7 @@
 //! all that it moved: at once where that is little, else window by window.
 //!
 //! As with bundle adjustment, deterministic replay takes a result in at a fixed frame, the later the larger it is, and real time when it is ready.
-//! A frame has one such task: what follows from a result begins a frame later, and both make way for a bundle adjustment that is taken in.
+//! What follows from a loop or a result begins a frame later, and in deterministic replay a frame after a bundle adjustment that is taken in.
 
 use std::collections::VecDeque;
 use std::time::Instant;
@@ -68,6 +68,9 @@ impl Tracker {
         let clock = Instant::now();
         let recognised = self.loops.recognise(&mut self.map, keyframe, &self.rig);
         let found = recognised.is_some();
+        if found {
+            self.closing.next = self.frames_seen + 1;
+        }
         match recognised {
             Some(correction) if correction.is_solved() => self.take_correction(&correction),
             Some(correction) => {
