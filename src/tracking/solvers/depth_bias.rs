@@ -7,10 +7,12 @@ use nalgebra::{Vector2, Vector3};
 
 use crate::geometry::Pinhole;
 
+/// The offset hardly differs from a change of scale, which would drift with it: it is held near zero.
+///
 /// How far a coefficient moves from one adjustment to the next, in standard deviations of a measurement: the offset, and the tilts.
-const STEP: Vector3<f64> = Vector3::new(0.012, 0.04, 0.04);
+const STEP: Vector3<f64> = Vector3::new(0.0004, 0.04, 0.04);
 /// How large it is in all, likewise.
-const SIZE: Vector3<f64> = Vector3::new(0.12, 0.4, 0.4);
+const SIZE: Vector3<f64> = Vector3::new(0.004, 0.4, 0.4);
 
 /// Measured inverse depth minus the true one, 1/metres: a plane over the image. Offset, tilt along x, tilt along y, each for half the image's
 /// width.
@@ -41,8 +43,7 @@ pub struct BiasPrior {
 impl BiasPrior {
     /// For an adjustment after one that found `last`; `sigma` is the standard deviation of a measured inverse depth, 1/metres.
     ///
-    /// Each keyframe's depth has errors of its own, so that no window decides alone. An offset hardly differs from a change of scale, so that
-    /// the coefficients are drawn to zero.
+    /// Each keyframe's depth has errors of its own, so that no window decides alone. The coefficients are drawn to zero.
     pub fn after(last: &DepthBias, sigma: f64) -> Self {
         let near = (STEP * sigma).map(|s| s.powi(-2));
         let small = (SIZE * sigma).map(|s| s.powi(-2));
