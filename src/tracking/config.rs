@@ -33,7 +33,7 @@ pub struct TrackingConfig {
     /// Standard deviation of measured inverse depth, 1/metres. A structured-light sensor measures disparity with constant noise,
     /// so its depth noise grows as `inverse_depth_sigma * depth²`.
     pub inverse_depth_sigma: f64,
-    /// Whether a systematic error of depth images is estimated: an offset and a tilt of inverse depth over the image.
+    /// Whether a systematic error of depth images is estimated: a tilt of inverse depth over the image.
     pub depth_bias: bool,
     /// Standard deviation of a stereo disparity at the finest pyramid level, pixels. Coarser levels scale it.
     pub disparity_sigma: f64,

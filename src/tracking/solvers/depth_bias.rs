@@ -7,9 +7,9 @@ use nalgebra::{Vector2, Vector3};
 
 use crate::geometry::Pinhole;
 
-/// The offset hardly differs from a change of scale, which would drift with it: it is held near zero.
-///
 /// How far a coefficient moves from one adjustment to the next, in standard deviations of a measurement: the offset, and the tilts.
+///
+/// The offset is held near zero. It hardly differs from a change of scale, and the scale would drift with it.
 const STEP: Vector3<f64> = Vector3::new(0.0004, 0.04, 0.04);
 /// How large it is in all, likewise.
 const SIZE: Vector3<f64> = Vector3::new(0.004, 0.4, 0.4);

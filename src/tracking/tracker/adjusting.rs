@@ -106,7 +106,7 @@ impl Tracker {
             return;
         }
         let all = Adjustment::of_all(&self.map, self.largest_submap(), &self.rig);
-        let Some(mut all) = all.map(|a| if self.seeks_bias() { a.with_bias(&self.rig) } else { a }) else { return };
+        let Some(mut all) = all.map(|all| self.with_bias(all)) else { return };
         all.solve(&self.rig.pinhole, self.rig.config.bundle_iterations);
         self.rig.depth_bias = all.bias().unwrap_or(self.rig.depth_bias);
         all.apply(&mut self.map, &self.rig.config).into_iter().for_each(|k| self.note_move(k, 1.0));
@@ -181,7 +181,7 @@ impl Tracker {
         let clock = Instant::now();
         // A keyframe that few landmarks hold would be torn from where its pixels put it.
         let window = held.then(|| Adjustment::of_window(&self.map, keyframe, &self.rig)).flatten();
-        let window = window.map(|w| if self.seeks_bias() { w.with_bias(&self.rig) } else { w });
+        let window = window.map(|window| self.with_bias(window));
         times.bundle_ms += milliseconds(clock);
         if let Some(window) = window {
             return self.begin(window, keyframe);
@@ -190,7 +190,12 @@ impl Tracker {
         Ok(())
     }
 
-    /// Rectified pairs are calibrated together, and a camera that drives forwards hardly shows a bias: depth images only.
+    /// An adjustment with the bias among its unknowns, where it is estimated.
+    fn with_bias(&self, adjustment: Adjustment) -> Adjustment {
+        if self.seeks_bias() { adjustment.with_bias(&self.rig) } else { adjustment }
+    }
+
+    /// Whether the bias of depth is estimated: of depth images only, for rectified pairs are calibrated together.
     pub(super) fn seeks_bias(&self) -> bool {
         self.rig.config.depth_bias && self.sensor == Sensor::Rgbd
     }

@@ -238,7 +238,7 @@ impl Tracker {
         self.loops.loops()
     }
 
-    /// The systematic error of the depth images; `None` if it was not estimated.
+    /// Bias of the depth images; `None` if it is not estimated.
     pub fn depth_bias(&self) -> Option<DepthBias> {
         self.seeks_bias().then_some(self.rig.depth_bias)
     }
