@@ -67,7 +67,9 @@ fn main() -> Result<(), Box<dyn Error>> {
 fn collect(progress: &Progress, done: &AtomicBool) -> Vec<MapSnapshot> {
     let mut snapshots: Vec<MapSnapshot> = Vec::new();
     while !done.load(Ordering::Relaxed) {
-        if let Some(snapshot) = progress.mapping.pop() {
+        let newest = progress.snapshots().get().map(|snapshot| (*snapshot).clone());
+        progress.snapshots().want();
+        if let Some(snapshot) = newest {
             // Pose updates publish a keyframe's map again; the newest counts.
             snapshots.retain(|earlier| earlier.keyframes != snapshot.keyframes);
             snapshots.push(snapshot);

@@ -26,6 +26,7 @@ pub mod splat;
 pub mod synthetic;
 pub mod tracking;
 pub mod verification;
+pub mod viewing;
 
 pub use config::Config;
 pub use evaluation::Metrics;

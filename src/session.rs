@@ -38,7 +38,7 @@ use crate::sequence::Sensor;
 /// ```
 #[derive(Debug)]
 pub struct Session {
-    recording: Recording,
+    recording: Arc<Recording>,
     gpu: Arc<Gpu>,
     out: PathBuf,
     checkpoint: Option<Checkpoint>,
@@ -152,7 +152,7 @@ impl Session {
     pub fn with_device(recording: Recording, gpu: Arc<Gpu>, out: &Path) -> Result<Self, SessionError> {
         check_first_frame(&recording)?;
         let lock = outputs::prepare_folder(out)?;
-        Ok(Self { recording, gpu, out: out.into(), checkpoint: None, _lock: lock })
+        Ok(Self { recording: Arc::new(recording), gpu, out: out.into(), checkpoint: None, _lock: lock })
     }
 
     /// Reopens an interrupted run from the checkpoint in its folder. `moved_to` is the recording's new path, where it has moved.
@@ -180,6 +180,11 @@ impl Session {
     /// The recording with its resolved configuration.
     pub fn recording(&self) -> &Recording {
         &self.recording
+    }
+
+    /// The same, for threads that outlive a borrow.
+    pub fn shared_recording(&self) -> Arc<Recording> {
+        self.recording.clone()
     }
 
     /// The adapter.

@@ -6,6 +6,7 @@ use clap::Args;
 use keysplat::{Config, SceneConfig, Session};
 use miette::IntoDiagnostic;
 
+use super::view::ViewOptions;
 use super::{Verbosity, generate, print, run};
 
 const SCENE: &str = include_str!("../../sequences/demo.toml");
@@ -17,6 +18,8 @@ pub struct DemoArgs {
     /// Folder for the results; the recording is kept in `<out>/demo-room`.
     #[arg(short, long, default_value = "out/demo")]
     out: PathBuf,
+    #[command(flatten)]
+    view: ViewOptions,
 }
 
 pub fn demo(args: &DemoArgs, verbosity: Verbosity) -> miette::Result<()> {
@@ -24,14 +27,16 @@ pub fn demo(args: &DemoArgs, verbosity: Verbosity) -> miette::Result<()> {
     let recording = args.out.join("demo-room");
     generate::render_if_changed(&scene, &recording, verbosity)?;
     let config = Config { map_scale: MAP_SCALE, ..Config::for_recording(&recording) };
-    run::replay(Session::open(config, &args.out).into_diagnostic()?, verbosity)?;
+    run::replay(Session::open(config, &args.out).into_diagnostic()?, &args.view, verbosity)?;
     if !verbosity.shows_progress() {
         return Ok(());
     }
     let (map, views) = (args.out.join("map.ply"), args.out.join("views"));
     print(&format!(
-        "\nThe map is {}; open it in any viewer of Gaussian splats, SuperSplat for one.\n\
+        "\nTo look at the map and the camera's path in a browser: keysplat view {}\n\
+         The map is {}; it opens in any viewer of Gaussian splats, too.\n\
          Held-out views beside their renders are in {}.\n",
+        args.out.display(),
         map.display(),
         views.display()
     ))

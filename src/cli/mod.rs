@@ -13,6 +13,7 @@ mod resume;
 mod run;
 mod source;
 mod stress;
+mod view;
 
 use std::io::{ErrorKind, IsTerminal, Write};
 use std::process::ExitCode;
@@ -61,6 +62,8 @@ enum Command {
     Eval(eval::EvalArgs),
     /// Draw a finished run as one HTML file that needs nothing else.
     Report(report::ReportArgs),
+    /// Show a finished run, or a map, in a browser.
+    View(view::ViewArgs),
     /// Measure speed.
     Bench(bench::BenchArgs),
     /// Try thousands of nasty cases against what is known of them.
@@ -108,6 +111,7 @@ fn execute(command: Command, verbosity: Verbosity) -> miette::Result<()> {
         Command::Generate(args) => generate::generate(&args, verbosity),
         Command::Eval(args) => eval::eval(&args, verbosity),
         Command::Report(args) => report::report(&args, verbosity),
+        Command::View(args) => view::view(&args, verbosity),
         Command::Bench(args) => bench::bench(&args, verbosity),
         Command::Stress(args) => stress::stress(&args),
         Command::Adapters => adapters::adapters(),

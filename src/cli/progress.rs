@@ -1,9 +1,7 @@
 //! Progress bars on standard error, and Ctrl-C.
 
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
-
 use indicatif::{ProgressBar, ProgressStyle};
+use keysplat::Progress;
 use miette::IntoDiagnostic;
 
 use super::Verbosity;
@@ -26,10 +24,10 @@ pub fn spinner(verbosity: Verbosity, template: &str) -> ProgressBar {
 }
 
 /// The first Ctrl-C ends the replay and writes the results so far, the second ends the program.
-pub fn stop_on_ctrl_c(stop: &Arc<AtomicBool>) -> miette::Result<()> {
-    let stop = stop.clone();
+pub fn stop_on_ctrl_c(progress: &Progress) -> miette::Result<()> {
+    let progress = progress.clone();
     ctrlc::set_handler(move || {
-        if stop.swap(true, Ordering::Relaxed) {
+        if progress.control().stop() {
             std::process::exit(130);
         }
         tracing::warn!("finishing with what there is; press Ctrl-C again to quit at once");

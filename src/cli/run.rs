@@ -3,12 +3,13 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use clap::Args;
 use indicatif::ProgressBar;
 use keysplat::config::SequenceConfig;
 use keysplat::export::MapFormat;
+use keysplat::pipeline::Outlook;
 use keysplat::presets::{self, Preset};
 use keysplat::sequence::{ASSUMED_CAMERA, is_camera_file};
 use keysplat::{Config, Gpu, Progress, Recording, Session, SessionError};
@@ -16,6 +17,7 @@ use miette::{IntoDiagnostic, miette};
 
 use super::calibrate::{self, find_camera};
 use super::source::SourceArgs;
+use super::view::{ViewOptions, Viewed};
 use super::{Verbosity, print_metrics, progress};
 
 #[derive(Args, Clone)]
@@ -75,6 +77,8 @@ pub struct RunArgs {
     /// Set any value of the configuration, e.g. --set mapping.refine.final_epochs=40 (may be given again).
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
+    #[command(flatten)]
+    view: ViewOptions,
 }
 
 /// The file's absolute path.
@@ -176,13 +180,14 @@ pub fn run(args: &RunArgs, verbosity: Verbosity) -> miette::Result<()> {
         args.source.camera = Some(file.to_string_lossy().into_owned());
     }
     let (recording, gpu) = args.open()?;
-    replay(Session::with_device(recording, gpu, &args.out).into_diagnostic()?, verbosity)
+    replay(Session::with_device(recording, gpu, &args.out).into_diagnostic()?, &args.view, verbosity)
 }
 
 /// Runs a session to its metrics, with progress bars, and prints them.
-pub fn replay(mut session: Session, verbosity: Verbosity) -> miette::Result<()> {
+pub fn replay(mut session: Session, view: &ViewOptions, verbosity: Verbosity) -> miette::Result<()> {
     let progress = Progress::default();
-    progress::stop_on_ctrl_c(&progress.stop)?;
+    let viewed = view.start(&session, &progress, verbosity)?;
+    progress::stop_on_ctrl_c(&progress)?;
     let frames = session.recording().sequence().entries.len() as u64;
     let done = AtomicBool::new(false);
     let replayed = std::thread::scope(|scope| {
@@ -195,9 +200,11 @@ pub fn replay(mut session: Session, verbosity: Verbosity) -> miette::Result<()> 
     })
     .into_diagnostic()?;
     let bar = progress::bar(verbosity, replayed.result.poses.len() as u64, "{wide_bar} {pos}/{len} views compared");
+    viewed.iter().for_each(Viewed::measuring);
     let finished = session.finish(replayed, &|views| bar.set_position(views as u64));
     bar.finish_and_clear();
-    match finished {
+    drop(session);
+    let ended = match finished {
         Ok(metrics) => print_metrics(&metrics, verbosity),
         Err(SessionError::Stopped) => {
             tracing::warn!("{}", SessionError::Stopped);
@@ -209,24 +216,20 @@ pub fn replay(mut session: Session, verbosity: Verbosity) -> miette::Result<()> 
             }
             Err(error).into_diagnostic()
         }
+    };
+    if let Some(viewed) = viewed.filter(|_| ended.is_ok()) {
+        viewed.stay_while_watched(&progress);
     }
+    ended
 }
 
 /// Keeps the bar up to date until the run is done.
 fn show(progress: &Progress, bar: &ProgressBar, done: &AtomicBool) {
-    let started = Instant::now();
-    let (mut keyframes, mut lost, mut mapped) = (0, "", String::new());
+    let mut outlook = Outlook::new(bar.length().unwrap_or(0) as usize);
     while !done.load(Ordering::Relaxed) {
-        if let Some(tracking) = progress.tracking.pop() {
-            bar.set_position(tracking.frames_done as u64);
-            keyframes = tracking.keyframes;
-            lost = if tracking.lost { "  LOST" } else { "" };
-        }
-        if let Some(map) = progress.mapping.pop() {
-            mapped = format!(", {} mapped, {} Gaussians, {:.1} dB", map.keyframes, map.cloud.len(), map.psnr_db);
-        }
-        let rate = bar.position() as f64 / started.elapsed().as_secs_f64().max(1e-3);
-        bar.set_message(format!("{rate:.1}/s  {keyframes} keyframes{mapped}{lost}"));
+        let state = outlook.look(progress);
+        bar.set_position(state.frames as u64);
+        bar.set_message(state.line());
         std::thread::sleep(Duration::from_millis(100));
     }
     bar.finish_and_clear();

@@ -3,6 +3,7 @@
 mod control;
 mod corrections;
 mod exposures;
+mod interlude;
 mod refine;
 mod state;
 mod within_limits;
@@ -15,6 +16,7 @@ use cpu_time::ThreadTime;
 use fastrand::Rng;
 use serde::{Deserialize, Serialize};
 
+pub use interlude::Interlude;
 pub use refine::{FinalRefinement, RefineReport};
 pub use state::MapperState;
 
@@ -107,12 +109,12 @@ impl Mapper {
         })
     }
 
-    /// Takes in a keyframe: inserts what the map lacks, optimises over the window, prunes. `stop` is polled between the steps. A keyframe without
-    /// depth is passed over until there is a map.
+    /// Takes in a keyframe: inserts what the map lacks, optimises over the window, prunes. `interlude` comes between the steps. A keyframe
+    /// without depth is passed over until there is a map.
     ///
     /// # Errors
     /// [`MappingError`] if a buffer does not fit or the device fails.
-    pub fn insert(&mut self, keyframe: &Keyframe, stop: &dyn Fn() -> bool) -> Result<KeyframeReport, MappingError> {
+    pub fn insert(&mut self, keyframe: &Keyframe, interlude: &dyn Interlude) -> Result<KeyframeReport, MappingError> {
         if keyframe.image.depth.is_none() && self.has_not_begun() {
             return Ok(KeyframeReport { id: keyframe.id, ..KeyframeReport::default() });
         }
@@ -144,7 +146,7 @@ impl Mapper {
                 ..KeyframeReport::default()
             });
         }
-        let report = self.optimise(iterations, stop)?;
+        let report = self.optimise(iterations, interlude)?;
         Ok(KeyframeReport { id: keyframe.id, inserted, gaussians: self.cloud.len(), exposure, ..report })
     }
 
@@ -249,7 +251,7 @@ impl Mapper {
     }
 
     /// Steps over the window, of which some score the Gaussians, whose density is then controlled; then steps over all keyframes. Reports what it did.
-    fn optimise(&mut self, iterations: usize, stop: &dyn Fn() -> bool) -> Result<KeyframeReport, MappingError> {
+    fn optimise(&mut self, iterations: usize, interlude: &dyn Interlude) -> Result<KeyframeReport, MappingError> {
         if self.cloud.is_empty() {
             return Ok(KeyframeReport::default());
         }
@@ -268,7 +270,7 @@ impl Mapper {
         } else if before.len() + scoring.len() <= self.batch() {
             scoring.splice(..0, before.drain(..));
         }
-        let mut taken = self.take(&before, &config.adam, stop)?;
+        let mut taken = self.take(&before, &config.adam, interlude)?;
         self.cloud.begin_round();
         let (mut pruned, mut grown) = (0, 0);
         if controlled {
@@ -278,19 +280,19 @@ impl Mapper {
             (pruned, grown) = self.timed("density", |mapper| mapper.control_density(scored.1, density))?;
         }
         let rest = self.with_consolidation(after);
-        taken += self.take(&rest, &config.adam, stop)?;
+        taken += self.take(&rest, &config.adam, interlude)?;
         if config.yields_to_keyframes {
-            taken += self.consolidate_until(stop)?;
+            taken += self.consolidate_until(interlude)?;
         }
         let (iterations, psnr_db) = (taken.steps, taken.psnr_db());
         Ok(KeyframeReport { pruned, grown, iterations, psnr_db, ..KeyframeReport::default() })
     }
 
-    /// Takes steps, in batches, until `stop`.
-    fn take(&mut self, steps: &[Step], adam: &AdamConfig, stop: &dyn Fn() -> bool) -> Result<Taken, MappingError> {
+    /// Takes steps, in batches, until `interlude` ends them.
+    fn take(&mut self, steps: &[Step], adam: &AdamConfig, interlude: &dyn Interlude) -> Result<Taken, MappingError> {
         let mut taken = Taken::default();
         for batch in steps.chunks(self.batch()) {
-            if stop() {
+            if interlude.between(self)?.is_break() {
                 break;
             }
             taken += self.timed("steps", |mapper| mapper.steps(batch, adam, None))?.0;

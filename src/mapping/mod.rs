@@ -25,7 +25,7 @@ pub use exposure::ExposureConfig;
 pub use host_time::HostTimes;
 pub use keyframe::{DepthSource, Keyframe, RightImage};
 pub use limits::LimitsConfig;
-pub use mapper::{FinalRefinement, KeyframeReport, Mapper, MapperState, RefineReport};
+pub use mapper::{FinalRefinement, Interlude, KeyframeReport, Mapper, MapperState, RefineReport};
 pub use message::{MapperMessage, PoseUpdate};
 pub use plane_sweep::PlaneSweepConfig;
 

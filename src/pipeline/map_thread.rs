@@ -5,21 +5,26 @@ use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use crossbeam::channel::Receiver;
+use crossbeam::channel::{Receiver, RecvTimeoutError};
 
-use super::progress::guarded;
+use super::attending::Attending;
+use super::progress::{MappingProgress, guarded};
 use super::read_thread::QueuedFrame;
 use super::{PipelineError, Progress};
 use crate::evaluation::machine;
 use crate::gpu::Gpu;
-use crate::mapping::{FinalRefinement, KeyframeId, KeyframeReport, Mapper, MapperMessage, MappingConfig, MappingError};
+use crate::mapping::{
+    FinalRefinement, Interlude, KeyframeId, KeyframeReport, Mapper, MapperMessage, MappingConfig, MappingError,
+};
 use crate::run_folder::{CheckpointError, Checkpointer, KeyframeRecord, RunState};
-use crate::splat::{Exposure, GaussianCloud, MapSnapshot};
+use crate::splat::{Exposure, GaussianCloud};
 
 /// Real time: the mapper pauses between two batches of steps while more frames than this wait for the tracker,
 const MOST_WAITING: usize = 2;
 /// but never longer than this.
 const LONGEST_PAUSE: Duration = Duration::from_millis(200);
+/// While no message comes, viewers are attended to this often.
+const IDLE_LOOK: Duration = Duration::from_millis(50);
 
 /// Result of the mapping thread, also when it ended early.
 #[derive(Debug, Default)]
@@ -36,9 +41,18 @@ pub(super) struct MapSummary {
 
 /// The map after a round of its refinement.
 pub(super) struct Round<'a> {
-    pub cloud: &'a Arc<GaussianCloud>,
+    mapper: &'a mut Mapper,
+    attending: &'a Attending<'a>,
     /// All optimisation steps so far.
     pub steps: usize,
+}
+
+impl Round<'_> {
+    /// The map; `None` where the device fails, which the next step reports.
+    pub fn cloud(&mut self) -> Option<Arc<GaussianCloud>> {
+        self.attending.download(self.mapper).ok()?;
+        Some(self.attending.cloud())
+    }
 }
 
 /// Input of the mapping thread.
@@ -71,21 +85,25 @@ impl MapThread<'_> {
             Ok(start) => start,
             Err(error) => return MapSummary { behind, error: Some(error), ..MapSummary::default() },
         };
-        let mut summary = MapSummary { cloud, keyframes: records, ..MapSummary::default() };
+        let mut summary = MapSummary { keyframes: records, ..MapSummary::default() };
         let mut checkpoints = Checkpoints { checkpointer, failed: false };
-        let mut snapshots = Snapshots::default();
-        let mapped = self.map_messages(&mut mapper, &mut summary, &mut snapshots, &mut checkpoints);
+        let attending = Attending::new(self.progress, cloud);
+        let mapped = self.map_messages(&mut mapper, &mut summary, &attending, &mut checkpoints);
         summary.error = mapped.err();
         // Also after an error: a device that still answers gives all that was mapped.
-        let last = guarded("mapping", || snapshots.last(&mapper, &mut summary, self.progress));
+        let last = guarded("mapping", || Ok(attending.download(&mut mapper)?));
         summary.error = summary.error.or(last.err());
         if summary.error.is_none() && mapper.has_not_begun() && !summary.keyframes.is_empty() {
             summary.error = Some(MappingError::NoDepth.into());
         }
         if summary.error.is_none() {
-            let refined = guarded("mapping", || self.refine(&mut mapper, &mut summary, refinement, &mut checkpoints, on_round));
+            let mut refining = Refining { thread: &self, attending: &attending, checkpoints: &mut checkpoints };
+            let refined = guarded("mapping", || refining.refine(&mut mapper, &mut summary, refinement, on_round));
             summary.error = refined.err();
+            let last = guarded("mapping", || Ok(attending.download(&mut mapper)?));
+            summary.error = summary.error.or(last.err());
         }
+        summary.cloud = attending.cloud();
         summary.step_ms = mapper.step_times().iter().map(|t| t.as_secs_f64() * 1e3).collect();
         summary
     }
@@ -134,20 +152,22 @@ impl MapThread<'_> {
         &self,
         mapper: &mut Mapper,
         summary: &mut MapSummary,
-        snapshots: &mut Snapshots,
+        attending: &Attending<'_>,
         checkpoints: &mut Checkpoints,
     ) -> Result<(), PipelineError> {
         let earlier_s = summary.keyframes.last().map_or(0.0, |record| record.done_s);
         let started = Instant::now();
         let inbox = Inbox { messages: self.messages, ahead: RefCell::default() };
-        while let Some(message) = inbox.next() {
+        while let Some(message) = inbox.next(|| Ok(attending.attend(mapper)?))? {
+            attending.while_paused(mapper)?;
             let (waiting, began) = (inbox.waiting(), Instant::now());
             let stop = || {
                 self.frames.into_iter().for_each(wait_for_tracker);
                 self.progress.stopped() || (self.config.yields_to_keyframes && inbox.keyframe_waits())
             };
             checkpoints.checkpointer.iter_mut().for_each(|c| c.received(&message));
-            let Processed { report, changed } = guarded("mapping", || self.process(mapper, message, &stop))?;
+            let processed = guarded("mapping", || self.process(mapper, message, &attending.until(&stop)));
+            let Processed { report, changed } = processed?;
             tracing::debug!(?report, "message processed");
             let record = |report| KeyframeRecord {
                 report,
@@ -157,10 +177,14 @@ impl MapThread<'_> {
                 host_bytes: machine::host_bytes(),
             };
             summary.keyframes.extend(report.map(record));
-            snapshots.is_stale |= changed;
-            if snapshots.is_due() {
-                guarded("mapping", || snapshots.take(mapper, summary, self.progress))?;
+            if changed {
+                attending.changed();
             }
+            if let Some(report) = report {
+                attending.publish(figures(mapper, summary.keyframes.len(), report.psnr_db));
+                self.progress.control().finished_one();
+            }
+            guarded("mapping", || Ok(attending.attend(mapper)?))?;
             // A keyframe that was cut short differs from that of an unbroken run.
             if report.is_some() && !self.progress.stopped() {
                 checkpoints.finished_one(mapper, None, &summary.keyframes);
@@ -169,7 +193,12 @@ impl MapThread<'_> {
         Ok(())
     }
 
-    fn process(&self, mapper: &mut Mapper, message: MapperMessage, stop: &dyn Fn() -> bool) -> Result<Processed, PipelineError> {
+    fn process(
+        &self,
+        mapper: &mut Mapper,
+        message: MapperMessage,
+        interlude: &dyn Interlude,
+    ) -> Result<Processed, PipelineError> {
         let (report, changed) = match message {
             MapperMessage::Points(points) => {
                 mapper.add_points(&points, 0)?;
@@ -178,33 +207,61 @@ impl MapThread<'_> {
             MapperMessage::PoseUpdate(updates) => (None, mapper.update_poses(&updates)? > 0),
             MapperMessage::Remove(keyframes) => (None, mapper.remove_keyframes(&keyframes)? > 0),
             MapperMessage::Keyframe(keyframe) => {
-                let report = mapper.insert(&keyframe, stop)?;
+                let report = mapper.insert(&keyframe, interlude)?;
                 (Some(report), report.inserted + report.iterations > 0)
             }
         };
         Ok(Processed { report, changed })
     }
+}
 
-    /// The final refinement, one round at a time, each published; continues the one that a resumed run had begun.
+/// The figures of the map after a keyframe or a round.
+fn figures(mapper: &Mapper, keyframes: usize, psnr_db: f32) -> MappingProgress {
+    let times = mapper.step_times();
+    let step_ms = times.last().map_or(0.0, |time| time.as_secs_f64() * 1e3);
+    MappingProgress { keyframes, gaussians: mapper.gaussians(), steps: times.len(), psnr_db, step_ms, refinement: None }
+}
+
+/// The final refinement.
+struct Refining<'a> {
+    thread: &'a MapThread<'a>,
+    attending: &'a Attending<'a>,
+    checkpoints: &'a mut Checkpoints,
+}
+
+impl Refining<'_> {
+    /// Refines one round at a time; continues the refinement that a resumed run had begun. Goes on beyond its end where that is wanted.
     fn refine(
-        &self,
+        &mut self,
         mapper: &mut Mapper,
         summary: &mut MapSummary,
         begun: Option<FinalRefinement>,
-        checkpoints: &mut Checkpoints,
         on_round: &mut dyn FnMut(Round<'_>),
     ) -> Result<(), PipelineError> {
+        let progress = self.thread.progress;
         let mut refinement = begun.map_or_else(|| mapper.begin_refinement(), Ok)?;
-        while let Some(report) = mapper.refine(&mut refinement, &|| self.progress.stopped())? {
+        loop {
+            let stop = || progress.stopped();
+            let Some(report) = mapper.refine(&mut refinement, &self.attending.until(&stop))? else {
+                if progress.stopped() || !progress.control().refines_on() || mapper.gaussians() == 0 {
+                    return Ok(());
+                }
+                refinement.extend(self.thread.config.refine.density_every.max(1));
+                continue;
+            };
             tracing::debug!(?report, "refined");
             summary.expose(&mapper.exposures().collect());
-            summary.publish(Arc::new(mapper.download()?), report.psnr_db, self.progress);
-            on_round(Round { cloud: &summary.cloud, steps: mapper.step_times().len() });
-            if !self.progress.stopped() {
-                checkpoints.finished_one(mapper, Some(&refinement), &summary.keyframes);
+            let figures = figures(mapper, summary.keyframes.len(), report.psnr_db);
+            self.attending.changed();
+            self.attending.publish(MappingProgress { refinement: Some(refinement.steps()), ..figures });
+            progress.control().finished_one();
+            self.attending.attend(mapper)?;
+            let steps = mapper.step_times().len();
+            on_round(Round { mapper, attending: self.attending, steps });
+            if !progress.stopped() {
+                self.checkpoints.finished_one(mapper, Some(&refinement), &summary.keyframes);
             }
         }
-        Ok(())
     }
 }
 
@@ -238,10 +295,18 @@ struct Inbox<'a> {
 }
 
 impl Inbox<'_> {
-    /// Blocks until the next message; `None` when the tracker has closed the channel.
-    fn next(&self) -> Option<MapperMessage> {
-        let first = self.ahead.borrow_mut().pop_front();
-        first.or_else(|| self.messages.recv().ok())
+    /// Blocks until the next message, and does what comes meanwhile; `None` when the tracker has closed the channel.
+    fn next(&self, mut meanwhile: impl FnMut() -> Result<(), PipelineError>) -> Result<Option<MapperMessage>, PipelineError> {
+        if let Some(first) = self.ahead.borrow_mut().pop_front() {
+            return Ok(Some(first));
+        }
+        loop {
+            match self.messages.recv_timeout(IDLE_LOOK) {
+                Ok(message) => return Ok(Some(message)),
+                Err(RecvTimeoutError::Disconnected) => return Ok(None),
+                Err(RecvTimeoutError::Timeout) => meanwhile()?,
+            }
+        }
     }
 
     fn waiting(&self) -> usize {
@@ -277,50 +342,12 @@ struct Processed {
     changed: bool,
 }
 
-/// Snapshots of the map while the recording lasts: a download waits for the GPU and moves the whole map.
-#[derive(Debug, Default)]
-struct Snapshots {
-    /// Whether the map has changed since the last one.
-    is_stale: bool,
-    /// When the last one was taken, and how long that took.
-    last: Option<(Instant, Duration)>,
-}
-
-impl Snapshots {
-    /// Time between two snapshots, in units of what one takes.
-    const INTERVAL: u32 = 20;
-
-    fn is_due(&self) -> bool {
-        self.is_stale && self.last.is_none_or(|(at, cost)| at.elapsed() >= Self::INTERVAL * cost)
-    }
-
-    fn take(&mut self, mapper: &Mapper, summary: &mut MapSummary, progress: &Progress) -> Result<(), PipelineError> {
-        let began = Instant::now();
-        let cloud = Arc::new(mapper.download()?);
-        self.last = Some((Instant::now(), began.elapsed()));
-        self.is_stale = false;
-        let psnr_db = summary.keyframes.last().map_or(0.0, |k| k.report.psnr_db);
-        summary.publish(cloud, psnr_db, progress);
-        Ok(())
-    }
-
-    /// That of the whole map, once no more keyframes come.
-    fn last(&mut self, mapper: &Mapper, summary: &mut MapSummary, progress: &Progress) -> Result<(), PipelineError> {
-        if self.is_stale { self.take(mapper, summary, progress) } else { Ok(()) }
-    }
-}
-
 impl MapSummary {
     /// Takes in the exposures of keyframes.
     fn expose(&mut self, exposures: &BTreeMap<KeyframeId, Exposure>) {
         for KeyframeRecord { report, .. } in &mut self.keyframes {
             report.exposure = exposures.get(&report.id).copied().unwrap_or(report.exposure);
         }
-    }
-
-    fn publish(&mut self, cloud: Arc<GaussianCloud>, psnr_db: f32, progress: &Progress) {
-        self.cloud = cloud.clone();
-        progress.mapping.force_push(MapSnapshot { cloud, keyframes: self.keyframes.len(), psnr_db });
     }
 }
 
@@ -352,10 +379,11 @@ mod tests {
         assert!(!inbox.keyframe_waits());
         sender.send(keyframe()).unwrap();
         assert!(inbox.keyframe_waits() && inbox.waiting() == 2);
-        assert!(matches!(inbox.next(), Some(MapperMessage::PoseUpdate(_))));
-        assert!(matches!(inbox.next(), Some(MapperMessage::Keyframe(_))));
+        let next = || inbox.next(|| Ok(())).unwrap();
+        assert!(matches!(next(), Some(MapperMessage::PoseUpdate(_))));
+        assert!(matches!(next(), Some(MapperMessage::Keyframe(_))));
         assert!(!inbox.keyframe_waits());
         drop(sender);
-        assert!(inbox.keyframe_waits() && inbox.next().is_none());
+        assert!(inbox.keyframe_waits() && next().is_none());
     }
 }

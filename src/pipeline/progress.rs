@@ -3,14 +3,18 @@
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 
 use crossbeam::queue::ArrayQueue;
+use image::RgbImage;
 
-use crate::mapping::MappingError;
+use super::control::Control;
+use super::newest::Newest;
+use crate::geometry::Se3;
+use crate::mapping::{KeyframeId, MappingError};
+use crate::render::Rendered;
 use crate::run_folder::CheckpointError;
-use crate::splat::MapSnapshot;
-use crate::tracking::TrackingError;
+use crate::splat::{MapSnapshot, ViewCamera};
+use crate::tracking::{KeyframePose, TrackingError};
 
 /// A run that ended early.
 #[derive(Debug, thiserror::Error)]
@@ -85,29 +89,139 @@ pub struct TrackingProgress {
     pub keyframes: usize,
     /// Whether the last frame has no pose.
     pub lost: bool,
+    /// Pose of the last frame that has one.
+    pub world_from_camera: Option<Se3>,
+    /// Tracking time of the last frame, milliseconds.
+    pub frame_ms: f64,
 }
 
-/// Progress of a run, shared with a display: each slot holds the newest value.
+/// Progress of the mapping thread.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct MappingProgress {
+    /// Keyframes mapped so far.
+    pub keyframes: usize,
+    /// Gaussians in the map.
+    pub gaussians: usize,
+    /// Optimisation steps so far.
+    pub steps: usize,
+    /// Mean PSNR of the newest steps' views, before each step.
+    pub psnr_db: f32,
+    /// Duration of the newest step, milliseconds.
+    pub step_ms: f64,
+    /// Steps of the final refinement, taken and planned, once it has begun.
+    pub refinement: Option<(usize, Option<usize>)>,
+}
+
+/// Keyframes as the tracker has them.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct KeyframePoses {
+    /// All of them, ascending by id.
+    pub keyframes: Vec<KeyframePose>,
+    /// Pairs that closed loops join.
+    pub loops: Vec<[KeyframeId; 2]>,
+}
+
+/// Image of a frame.
 #[derive(Clone, Debug)]
-pub struct Progress {
-    /// Newest progress of the tracker.
-    pub tracking: Arc<ArrayQueue<TrackingProgress>>,
-    /// Newest snapshot of the map.
-    pub mapping: Arc<ArrayQueue<MapSnapshot>>,
-    /// Set to end the run early; its partial result is returned.
-    pub stop: Arc<AtomicBool>,
+pub struct FrameImage {
+    /// Index of the frame.
+    pub frame: usize,
+    /// As recorded.
+    pub color: RgbImage,
 }
 
-impl Default for Progress {
+/// A view of the map to be rendered by the mapper, between two batches of its steps.
+pub struct RenderOrder {
+    /// The view.
+    pub camera: ViewCamera,
+    /// Receives the view, or why there is none.
+    pub reply: Box<dyn FnOnce(Result<Rendered, String>) + Send>,
+}
+
+/// Views that wait for the mapper, at most.
+const MOST_ORDERS: usize = 4;
+
+/// A run as others see and steer it: the newest value of each kind, and switches. No thread of the run waits for a reader.
+#[derive(Clone, Debug, Default)]
+pub struct Progress {
+    shared: Arc<Shared>,
+}
+
+#[derive(Debug, Default)]
+struct Shared {
+    tracking: Newest<TrackingProgress>,
+    mapping: Newest<MappingProgress>,
+    snapshots: Newest<MapSnapshot>,
+    poses: Newest<KeyframePoses>,
+    images: Newest<FrameImage>,
+    orders: Orders,
+    control: Control,
+}
+
+/// Views that wait for the mapper.
+struct Orders(ArrayQueue<RenderOrder>);
+
+impl Default for Orders {
     fn default() -> Self {
-        Self { tracking: Arc::new(ArrayQueue::new(1)), mapping: Arc::new(ArrayQueue::new(1)), stop: Arc::default() }
+        Self(ArrayQueue::new(MOST_ORDERS))
+    }
+}
+
+impl std::fmt::Debug for Orders {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{} of {MOST_ORDERS} orders", self.0.len())
     }
 }
 
 impl Progress {
+    /// Progress of the tracker.
+    pub fn tracking(&self) -> &Newest<TrackingProgress> {
+        &self.shared.tracking
+    }
+
+    /// Progress of the mapper.
+    pub fn mapping(&self) -> &Newest<MappingProgress> {
+        &self.shared.mapping
+    }
+
+    /// The map; a newer one is downloaded where it is wanted.
+    pub fn snapshots(&self) -> &Newest<MapSnapshot> {
+        &self.shared.snapshots
+    }
+
+    /// The keyframes, where they are wanted.
+    pub fn poses(&self) -> &Newest<KeyframePoses> {
+        &self.shared.poses
+    }
+
+    /// The image of the last frame, where it is wanted.
+    pub fn images(&self) -> &Newest<FrameImage> {
+        &self.shared.images
+    }
+
+    /// Switches of the run.
+    pub fn control(&self) -> &Control {
+        &self.shared.control
+    }
+
     /// Whether the run is to end early.
     pub fn stopped(&self) -> bool {
-        self.stop.load(Ordering::Relaxed)
+        self.control().is_stopped()
+    }
+
+    /// Orders a view; `false` if too many wait.
+    pub fn order(&self, order: RenderOrder) -> bool {
+        self.shared.orders.0.push(order).is_ok()
+    }
+
+    /// The oldest order, taken off.
+    pub(super) fn next_order(&self) -> Option<RenderOrder> {
+        self.shared.orders.0.pop()
+    }
+
+    /// Whether a view is ordered.
+    pub(super) fn has_order(&self) -> bool {
+        !self.shared.orders.0.is_empty()
     }
 }
 

@@ -1,5 +1,6 @@
 //! Decodes frames and extracts their features ahead of the tracker, and keeps the replay's clock.
 
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use crossbeam::channel::{Sender, TrySendError};
@@ -53,12 +54,14 @@ impl<'a> ReadThread<'a> {
     /// Sends every readable frame, in order. Real-time replay waits for each frame's timestamp and never blocks on the tracker.
     pub fn read(&self) -> ReadSummary {
         let mut summary = ReadSummary::default();
-        let started = Instant::now();
+        // The recording's clock stands while the run is held.
+        let (started, held_ms) = (Instant::now(), AtomicU64::new(0));
+        let elapsed = || started.elapsed().saturating_sub(Duration::from_millis(held_ms.load(Ordering::Relaxed)));
         let first_s = self.sequence.entries.first().map_or(0.0, |entry| entry.timestamp_s);
         let due = |frame: &Frame| Duration::try_from_secs_f64(frame.timestamp_s - first_s).unwrap_or_default();
         let prepare = |frame: Frame| {
             // What is late already is not worth its features.
-            let is_late = self.real_time && started.elapsed() > due(&frame) + LATE_AFTER;
+            let is_late = self.real_time && elapsed() > due(&frame) + LATE_AFTER;
             (!is_late).then(|| QueuedFrame { extracted: self.front_end.as_ref().map(|f| f.extract(&frame)), frame })
         };
         let ahead = rayon::current_num_threads().min(MOST_AT_ONCE);
@@ -76,8 +79,10 @@ impl<'a> ReadThread<'a> {
                     return !self.progress.stopped();
                 }
             };
+            let pause = self.progress.control().wait_while_paused(|| ());
+            held_ms.fetch_add(pause.as_millis() as u64, Ordering::Relaxed);
             if self.real_time {
-                std::thread::sleep(due(&queued.frame).saturating_sub(started.elapsed()));
+                std::thread::sleep(due(&queued.frame).saturating_sub(elapsed()));
                 match self.sender.try_send(queued) {
                     Ok(()) => {}
                     Err(TrySendError::Full(_)) => summary.late += 1,

@@ -114,7 +114,7 @@ fn gather(
         trajectory,
         keyframes: track.keyframes,
         tracking_ms: track.frames.iter().map(|frame| frame.times.total_ms()).collect(),
-        history: History { frames: track.frames, keyframes: map.keyframes },
+        history: History { frames: track.frames, keyframes: map.keyframes, loops: track.loops },
         frames_read_failed: read.read_failed,
         frames_late: read.late,
         keyframes_deferred: track.deferred,

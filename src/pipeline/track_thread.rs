@@ -4,10 +4,10 @@ use std::collections::BTreeMap;
 
 use crossbeam::channel::{Receiver, Sender, TrySendError};
 
-use super::progress::{TrackingProgress, guarded};
+use super::progress::{FrameImage, KeyframePoses, TrackingProgress, guarded};
 use super::read_thread::QueuedFrame;
 use super::{PipelineError, Progress};
-use crate::geometry::{StampedPose, Trajectory};
+use crate::geometry::{Se3, StampedPose, Trajectory};
 use crate::mapping::{DepthSource, Keyframe, KeyframeId, MapperMessage, PoseUpdate, RightImage};
 use crate::recording::Recording;
 use crate::run_folder::FrameRecord;
@@ -21,6 +21,7 @@ pub(super) struct TrackSummary {
     pub trajectory: Vec<(usize, StampedPose)>,
     pub keyframes: Vec<KeyframePose>,
     pub frames: Vec<FrameRecord>,
+    pub loops: Vec<[KeyframeId; 2]>,
     /// Real time: keyframes that the mapper never received.
     pub deferred: usize,
     pub depth_bias: Option<DepthBias>,
@@ -126,6 +127,7 @@ impl TrackThread<'_> {
         };
         let rectifier = Rectifier::new(&sequence.camera, config.map_scale);
         let mut whole = true;
+        let mut shown = Shown { progress: self.progress, world_from_camera: None, moved: false };
         let mut keyframes = KeyframeSender::new(self.mapper, config.replay.real_time);
         for QueuedFrame { frame, extracted } in self.frames {
             let Some(extracted) = extracted else { continue };
@@ -140,8 +142,7 @@ impl TrackThread<'_> {
             };
             let lost = tracked.state == TrackingState::Lost;
             summary.frames.push(FrameRecord { frame: frame.index, lost, times: tracked.times });
-            let progress = TrackingProgress { frames_done: frame.index + 1, keyframes: tracker.keyframe_count(), lost };
-            self.progress.tracking.force_push(progress);
+            shown.frame(&frame, &tracked, &tracker);
             if !keyframes.retry() || !self.send(&mut keyframes, &rectifier, &frame, tracked) {
                 whole = false;
                 break;
@@ -156,6 +157,8 @@ impl TrackThread<'_> {
         summary.trajectory = tracker.trajectory();
         summary.keyframes = tracker.keyframes();
         summary.depth_bias = tracker.depth_bias();
+        summary.loops = loops(&tracker);
+        self.progress.poses().put(poses(&tracker));
         let unjoined = tracker.unjoined_keyframes();
         if !unjoined.is_empty() {
             tracing::warn!(
@@ -191,6 +194,50 @@ impl TrackThread<'_> {
     }
 }
 
+/// What the thread shows of its progress.
+struct Shown<'a> {
+    progress: &'a Progress,
+    /// Of the last frame that has a pose.
+    world_from_camera: Option<Se3>,
+    /// Whether keyframes came or moved since they were shown.
+    moved: bool,
+}
+
+impl Shown<'_> {
+    fn frame(&mut self, frame: &Frame, tracked: &TrackedFrame, tracker: &Tracker) {
+        self.world_from_camera = tracked.world_from_camera.or(self.world_from_camera);
+        self.moved |= tracked.keyframe.is_some() || !tracked.updates.is_empty();
+        self.progress.tracking().put(TrackingProgress {
+            frames_done: frame.index + 1,
+            keyframes: tracker.keyframe_count(),
+            lost: tracked.state == TrackingState::Lost,
+            world_from_camera: self.world_from_camera,
+            frame_ms: tracked.times.total_ms(),
+        });
+        show_image(self.progress, frame);
+        if self.moved && self.progress.poses().is_wanted() {
+            self.moved = false;
+            self.progress.poses().put(poses(tracker));
+        }
+    }
+}
+
+/// Publishes a frame's image where it is wanted.
+pub(super) fn show_image(progress: &Progress, frame: &Frame) {
+    if progress.images().is_wanted() {
+        progress.images().put(FrameImage { frame: frame.index, color: frame.color.clone() });
+    }
+}
+
+fn poses(tracker: &Tracker) -> KeyframePoses {
+    KeyframePoses { keyframes: tracker.keyframes(), loops: loops(tracker) }
+}
+
+/// Pairs of keyframes that closed loops join.
+fn loops(tracker: &Tracker) -> Vec<[KeyframeId; 2]> {
+    tracker.loops().iter().map(|closed| [closed.keyframe, closed.place]).collect()
+}
+
 fn pose_update(KeyframeUpdate { id, world_from_camera, scale }: KeyframeUpdate) -> PoseUpdate {
     PoseUpdate { keyframe: id, world_from_camera, scale }
 }
@@ -218,7 +265,7 @@ mod tests {
     use image::RgbImage;
 
     use super::*;
-    use crate::geometry::{Pinhole, Se3};
+    use crate::geometry::Pinhole;
     use crate::sequence::{DepthImage, RectifiedImage};
 
     fn keyframe(id: KeyframeId) -> MapperMessage {

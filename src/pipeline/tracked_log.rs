@@ -93,10 +93,12 @@ impl<'a> TrackedLog<'a> {
         drop(sender);
         let started = Instant::now();
         let mut paused = Duration::ZERO;
-        let mut on_round = |round: Round<'_>| {
+        let mut on_round = |mut round: Round<'_>| {
             let reached = Instant::now();
             let wall_s = (started.elapsed() - paused).as_secs_f64();
-            on_round(MappedLog { cloud: round.cloud.clone(), exposures: Exposures::default(), wall_s, steps: round.steps });
+            if let Some(cloud) = round.cloud() {
+                on_round(MappedLog { cloud, exposures: Exposures::default(), wall_s, steps: round.steps });
+            }
             paused += reached.elapsed();
         };
         let config = &self.scene.as_ref().map_or_else(|| config.clone(), |scene| scene.in_units(config));

@@ -8,10 +8,13 @@ use base64::engine::general_purpose::STANDARD;
 use super::{ReportError, Run, plots};
 use crate::evaluation::Metrics;
 use crate::run_folder::outputs;
+use crate::viewing::{self, Embedded, Finished};
 
 const TEMPLATE: &str = include_str!("page.html");
 /// Held-out views in the page: so many, evenly spread, and the worst.
 const VIEWS: usize = 8;
+/// Keyframes whose images are in the page.
+const KEYFRAME_IMAGES: usize = 16;
 
 pub fn html(run: &Run) -> Result<String, ReportError> {
     let parts = [
@@ -19,6 +22,7 @@ pub fn html(run: &Run) -> Result<String, ReportError> {
         ("SUMMARY", summary(&run.metrics)),
         ("CARDS", cards(&run.metrics)),
         ("PLOTS", plots_of(run).map_err(ReportError::Drawing)?),
+        ("MAP", map(run)),
         ("VIEWS", views(run)?),
         ("TABLE", escaped(&run.metrics.to_string())),
         ("CONFIG", run.config.as_deref().map(escaped).unwrap_or_default()),
@@ -28,6 +32,22 @@ pub fn html(run: &Run) -> Result<String, ReportError> {
         page = page.replace(&format!("<!--{name}-->"), &text);
     }
     Ok(page)
+}
+
+/// The viewer with the map and the images of some keyframes; nothing where the folder has no map.
+fn map(run: &Run) -> String {
+    let finished = match Finished::open(&run.folder) {
+        Ok(finished) => finished,
+        Err(error) => {
+            tracing::warn!("the report shows no map: {error}");
+            return String::new();
+        }
+    };
+    let Embedded { style, script, messages } = viewing::embedded(&finished.messages(KEYFRAME_IMAGES));
+    format!(
+        "<h2>The map</h2>\n<style>\n{style}</style>\n<section id=\"viewer\" class=\"embedded\"></section>\n{messages}\
+         <script type=\"module\">\n{script}</script>\n"
+    )
 }
 
 fn escaped(text: &str) -> String {

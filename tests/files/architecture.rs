@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 const EVERYTHING_ABOVE: &[&str] = &["*"];
 
 /// A module, and the modules whose items it may name. `verification` is in no list but the command line's: production does not use the oracle.
-const ALLOWED: [(&str, &[&str]); 23] = [
+const ALLOWED: [(&str, &[&str]); 24] = [
     ("files", &[]),
     ("geometry", &[]),
     ("sequence", &["geometry"]),
@@ -33,9 +33,37 @@ const ALLOWED: [(&str, &[&str]); 23] = [
     ),
     (
         "pipeline",
-        &["geometry", "sequence", "splat", "tracking", "gpu", "mapping", "evaluation", "config", "recording", "run_folder"],
+        &[
+            "geometry",
+            "sequence",
+            "splat",
+            "tracking",
+            "gpu",
+            "render",
+            "mapping",
+            "evaluation",
+            "config",
+            "recording",
+            "run_folder",
+        ],
     ),
-    ("report", &["files", "evaluation", "run_folder"]),
+    (
+        "viewing",
+        &[
+            "geometry",
+            "sequence",
+            "splat",
+            "gpu",
+            "render",
+            "export",
+            "evaluation",
+            "config",
+            "recording",
+            "run_folder",
+            "pipeline",
+        ],
+    ),
+    ("report", &["files", "evaluation", "run_folder", "viewing"]),
     (
         "session",
         &[

@@ -46,7 +46,7 @@ fn a_lost_device_ends_the_run_with_what_was_mapped() {
     let replay = std::thread::scope(|scope| {
         let (gpu, progress) = (&gpu, &progress);
         scope.spawn(move || {
-            while progress.mapping.pop().is_none() {
+            while progress.snapshots().get().is_none() {
                 std::thread::sleep(Duration::from_millis(1));
             }
             gpu.device.destroy();

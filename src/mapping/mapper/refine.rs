@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use crate::mapping::{DensityConfig, MappingError, RefineConfig};
 use crate::optimise::AdamConfig;
 
-use super::{BATCH, Mapper, Step, Taken};
+use super::{BATCH, Interlude, Mapper, Step, Taken};
 
 /// Share of the steps after which nothing is pruned: neighbours take some epochs to fill the place of a Gaussian.
 const LAST_CONTROL: f32 = 0.8;
@@ -22,6 +22,9 @@ pub struct FinalRefinement {
     /// Rates at the beginning.
     adam: AdamConfig,
     done: usize,
+    /// Steps beyond the configured ones that were asked for since.
+    #[serde(skip)]
+    more: usize,
     rounds: usize,
     /// Measurements of the exposures so far.
     pub(super) exposed: usize,
@@ -51,12 +54,23 @@ impl FinalRefinement {
         match (self.config.seconds, self.started) {
             (Some(seconds), Some(started)) => (started.elapsed().as_secs_f64() / seconds.max(f64::MIN_POSITIVE)).min(1.0) as f32,
             _ if self.config.steps == 0 => 1.0,
-            _ => self.done as f32 / self.config.steps as f32,
+            _ => (self.done as f32 / self.config.steps as f32).min(1.0),
         }
     }
 
     fn is_done(&self) -> bool {
-        self.progress() >= 1.0
+        self.progress() >= 1.0 && self.more == 0
+    }
+
+    /// Goes on beyond its end for so many steps, at the last rates and without density control.
+    pub fn extend(&mut self, steps: usize) {
+        self.more += steps;
+    }
+
+    /// Steps taken, and those of the whole refinement; unknown where seconds bound it.
+    pub fn steps(&self) -> (usize, Option<usize>) {
+        let planned = self.config.seconds.is_none().then_some(self.config.steps);
+        (self.done, planned.map(|steps| steps.max(self.done + self.more)))
     }
 
     /// The rates for the next step.
@@ -75,14 +89,14 @@ impl Mapper {
         steps
     }
 
-    /// Takes steps of the running epoch until `stop`.
+    /// Takes steps of the running epoch until `interlude` ends them.
     ///
     /// # Errors
     /// [`MappingError`] if a buffer does not fit or the device fails.
-    pub(super) fn consolidate_until(&mut self, stop: &dyn Fn() -> bool) -> Result<Taken, MappingError> {
+    pub(super) fn consolidate_until(&mut self, interlude: &dyn Interlude) -> Result<Taken, MappingError> {
         let config = self.config.clone();
         let mut taken = Taken::default();
-        while !self.cloud.is_empty() && !stop() {
+        while !self.cloud.is_empty() && interlude.between(self)?.is_continue() {
             let batch = self.draw(self.batch(), false);
             taken += self.steps(&batch, &config.adam, None)?.0;
         }
@@ -118,33 +132,39 @@ impl Mapper {
         };
         let started = config.seconds.map(|_| Instant::now());
         self.epoch.clear();
-        Ok(FinalRefinement { adam: self.config.adam.clone(), config, done: 0, rounds: 0, exposed: 0, started })
+        Ok(FinalRefinement { adam: self.config.adam.clone(), config, done: 0, more: 0, rounds: 0, exposed: 0, started })
     }
 
-    /// The steps up to the next density control, and that; `None` when all are done, or `stop` says so.
+    /// The steps up to the next density control, and that; `None` when all are done, or `interlude` ends them.
     ///
     /// # Errors
     /// [`MappingError`] if a buffer does not fit or the device fails.
     pub fn refine(
         &mut self,
         refinement: &mut FinalRefinement,
-        stop: &dyn Fn() -> bool,
+        interlude: &dyn Interlude,
     ) -> Result<Option<RefineReport>, MappingError> {
         let RefineConfig { steps, density_every, growth_share, half_size_share, .. } = refinement.config;
-        if refinement.is_done() || self.cloud.is_empty() || self.keyframes.is_empty() || stop() {
+        let is_over = refinement.is_done() || self.cloud.is_empty() || self.keyframes.is_empty();
+        if is_over || interlude.between(self)?.is_break() {
             return Ok(None);
         }
         let density = DensityConfig { views: refinement.config.density_views, ..self.config.density.clone() };
         let density = if refinement.progress() >= growth_share { density.without_growth() } else { density };
         let mut adam = refinement.rates();
         let mut taken = Taken::default();
-        let end = steps.min(refinement.done + density_every);
-        while refinement.done < end && !refinement.is_done() && !stop() {
+        let is_extra = refinement.progress() >= 1.0;
+        let left = if is_extra { refinement.more } else { steps - refinement.done };
+        let end = refinement.done + density_every.min(left);
+        while refinement.done < end && !refinement.is_done() && interlude.between(self)?.is_continue() {
             let coarse = refinement.progress() < half_size_share;
             let batch = self.draw(BATCH.min(end - refinement.done), coarse);
             adam = refinement.rates();
             taken += self.steps(&batch, &adam, None)?.0;
             refinement.done += batch.len();
+            if is_extra {
+                refinement.more = refinement.more.saturating_sub(batch.len());
+            }
         }
         self.refine_exposures(refinement)?;
         let is_controlled = refinement.progress() < LAST_CONTROL;

@@ -10,9 +10,9 @@ use std::time::Instant;
 
 pub(super) use scene::Scene;
 
-use super::progress::{TrackingProgress, guarded};
+use super::progress::{KeyframePoses, TrackingProgress, guarded};
 use super::read_thread::QueuedFrame;
-use super::track_thread::{KeyframeSender, TrackSummary, TrackThread, right_image};
+use super::track_thread::{KeyframeSender, TrackSummary, TrackThread, right_image, show_image};
 use crate::geometry::{Se3, StampedPose};
 use crate::mapping::{DepthSource, Keyframe, MapperMessage};
 use crate::recording::Recording;
@@ -60,6 +60,10 @@ impl Follower<'_> {
         nearest.into_iter().take(COVISIBLE).map(|(_, id)| id).collect()
     }
 
+    fn poses(&self) -> KeyframePoses {
+        KeyframePoses { keyframes: self.keyframes.iter().map(|known| known.pose).collect(), loops: Vec::new() }
+    }
+
     fn make_keyframe(&mut self, frame: &Frame, world_from_camera: Se3) -> Keyframe {
         let sequence = self.recording.sequence();
         let rectifier = self.rectifiers.of(sequence.camera_of(frame.index));
@@ -87,6 +91,7 @@ pub(super) fn follow(thread: &TrackThread<'_>, scene: &Scene<'_>) -> TrackSummar
     if sequence.sensor != Sensor::Rgbd && mapper.send(MapperMessage::Points(scene.thinned_points())).is_err() {
         return summary;
     }
+    let mut world_from_camera = None;
     for QueuedFrame { frame, .. } in frames {
         let started = Instant::now();
         let known = recording.known_pose(frame.timestamp_s);
@@ -100,7 +105,13 @@ pub(super) fn follow(thread: &TrackThread<'_>, scene: &Scene<'_>) -> TrackSummar
         let times = StageTimes { features_ms: started.elapsed().as_secs_f64() * 1e3, ..StageTimes::default() };
         summary.frames.push(FrameRecord { frame: frame.index, lost: known.is_none(), times });
         let (frames_done, keyframes) = (frame.index + 1, follower.keyframes.len());
-        progress.tracking.force_push(TrackingProgress { frames_done, keyframes, lost: known.is_none() });
+        world_from_camera = known.or(world_from_camera);
+        let (lost, frame_ms) = (known.is_none(), times.total_ms());
+        progress.tracking().put(TrackingProgress { frames_done, keyframes, lost, world_from_camera, frame_ms });
+        show_image(progress, &frame);
+        if progress.poses().is_wanted() {
+            progress.poses().put(follower.poses());
+        }
         let message = match keyframe.transpose() {
             Ok(keyframe) => keyframe.map(|keyframe| MapperMessage::Keyframe(Box::new(keyframe))),
             Err(error) => {
@@ -113,6 +124,7 @@ pub(super) fn follow(thread: &TrackThread<'_>, scene: &Scene<'_>) -> TrackSummar
         }
     }
     summary.deferred = sender.finish(Vec::new(), Vec::new());
-    summary.keyframes = follower.keyframes.iter().map(|known| known.pose).collect();
+    progress.poses().put(follower.poses());
+    summary.keyframes = follower.poses().keyframes;
     summary
 }

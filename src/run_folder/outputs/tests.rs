@@ -140,6 +140,7 @@ fn result() -> RunResult {
         history: History {
             frames: vec![FrameRecord { frame: 0, lost: false, times: StageTimes::default() }],
             keyframes: vec![record],
+            loops: vec![[1, 0]],
         },
         cloud: Arc::new(GaussianCloud::new(ShDegree::ALL[0])),
         ..RunResult::default()

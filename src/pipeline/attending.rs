@@ -1,0 +1,145 @@
+//! What the mapping thread does for others between two batches of its steps: snapshots, ordered views, pauses.
+
+use std::cell::RefCell;
+use std::ops::ControlFlow;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use super::Progress;
+use super::progress::{MappingProgress, RenderOrder};
+use crate::mapping::{Interlude, Mapper, MappingError};
+use crate::splat::{GaussianCloud, MapSnapshot};
+
+/// Snapshots for viewers take at most one part in so many of the mapper's time, at most one in this time:
+const SNAPSHOT_SHARE: u32 = 100;
+const SNAPSHOT_EVERY: Duration = Duration::from_millis(250);
+/// Those that are kept in case the device fails are as old as this at most, and one part in so many of the time.
+const KEPT_SHARE: u32 = 20;
+const KEPT_EVERY: Duration = Duration::from_secs(10);
+/// Ordered views take at most one part in so many of its time.
+const RENDER_SHARE: u32 = 10;
+
+/// Work that may take a share of the time.
+#[derive(Debug, Default)]
+struct Share {
+    /// When it was done last, and how long that took.
+    last: Option<(Instant, Duration)>,
+}
+
+impl Share {
+    fn is_due(&self, one_in: u32, every: Duration) -> bool {
+        self.last.is_none_or(|(at, cost)| at.elapsed() >= every.max(one_in * cost))
+    }
+
+    fn take<T>(&mut self, work: impl FnOnce() -> T) -> T {
+        let began = Instant::now();
+        let done = work();
+        self.last = Some((Instant::now(), began.elapsed()));
+        done
+    }
+}
+
+/// The mapping thread's duties to others.
+#[derive(Debug)]
+pub(super) struct Attending<'a> {
+    progress: &'a Progress,
+    state: RefCell<State>,
+}
+
+#[derive(Debug, Default)]
+struct State {
+    /// The newest map that was downloaded.
+    cloud: Arc<GaussianCloud>,
+    /// Whether the map has changed since.
+    is_stale: bool,
+    snapshots: Share,
+    renders: Share,
+    figures: MappingProgress,
+}
+
+impl<'a> Attending<'a> {
+    pub fn new(progress: &'a Progress, cloud: Arc<GaussianCloud>) -> Self {
+        Self { progress, state: RefCell::new(State { cloud, ..State::default() }) }
+    }
+
+    /// The newest map that was downloaded.
+    pub fn cloud(&self) -> Arc<GaussianCloud> {
+        self.state.borrow().cloud.clone()
+    }
+
+    /// The map has changed.
+    pub fn changed(&self) {
+        self.state.borrow_mut().is_stale = true;
+    }
+
+    /// Publishes the figures of the map.
+    pub fn publish(&self, figures: MappingProgress) {
+        self.state.borrow_mut().figures = figures;
+        self.progress.mapping().put(figures);
+    }
+
+    /// Renders what is ordered and downloads what is wanted, within their shares of the time.
+    pub fn attend(&self, mapper: &mut Mapper) -> Result<(), MappingError> {
+        let mut state = self.state.borrow_mut();
+        let wanted = self.progress.snapshots().is_wanted() && state.snapshots.is_due(SNAPSHOT_SHARE, SNAPSHOT_EVERY);
+        if state.is_stale && (wanted || state.snapshots.is_due(KEPT_SHARE, KEPT_EVERY)) {
+            state.download(mapper, self.progress)?;
+        }
+        if self.progress.has_order() && state.renders.is_due(RENDER_SHARE, Duration::ZERO) {
+            let Some(RenderOrder { camera, reply }) = self.progress.next_order() else { return Ok(()) };
+            let rendered = state.renders.take(|| mapper.render(&camera));
+            reply(rendered.map_err(|error| error.to_string()));
+        }
+        Ok(())
+    }
+
+    /// Downloads the map unless it has not changed.
+    pub fn download(&self, mapper: &mut Mapper) -> Result<(), MappingError> {
+        let mut state = self.state.borrow_mut();
+        if state.is_stale { state.download(mapper, self.progress) } else { Ok(()) }
+    }
+
+    /// Between two batches of steps, which end where `stop` says so.
+    pub fn until<'b>(&'b self, stop: &'b dyn Fn() -> bool) -> impl Interlude + 'b
+    where
+        'a: 'b,
+    {
+        Until { attending: self, stop }
+    }
+
+    /// Attends while the run is held.
+    pub fn while_paused(&self, mapper: &mut Mapper) -> Result<(), MappingError> {
+        let mut attended = Ok(());
+        self.progress.control().wait_while_paused(|| {
+            if attended.is_ok() {
+                attended = self.attend(mapper);
+            }
+        });
+        attended
+    }
+}
+
+impl State {
+    fn download(&mut self, mapper: &mut Mapper, progress: &Progress) -> Result<(), MappingError> {
+        self.cloud = Arc::new(self.snapshots.take(|| mapper.download())?);
+        self.is_stale = false;
+        let MappingProgress { keyframes, psnr_db, .. } = self.figures;
+        progress.snapshots().put(MapSnapshot { cloud: self.cloud.clone(), keyframes, psnr_db });
+        Ok(())
+    }
+}
+
+struct Until<'a, 'b> {
+    attending: &'b Attending<'a>,
+    stop: &'b dyn Fn() -> bool,
+}
+
+impl Interlude for Until<'_, '_> {
+    fn between(&self, mapper: &mut Mapper) -> Result<ControlFlow<()>, MappingError> {
+        // Steps were taken since the last time.
+        self.attending.changed();
+        self.attending.attend(mapper)?;
+        self.attending.while_paused(mapper)?;
+        Ok(if (self.stop)() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) })
+    }
+}

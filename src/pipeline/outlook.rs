@@ -1,0 +1,130 @@
+//! Where a run stands and how long it will take, from the progress of its threads.
+
+use std::time::Instant;
+
+use super::Progress;
+use super::progress::{MappingProgress, TrackingProgress};
+
+/// The rate of frames is that of about so many seconds.
+const RATE_SECONDS: f64 = 20.0;
+
+/// A run as it stands.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct RunState {
+    /// Seconds since it began.
+    pub s: f64,
+    /// Frames tracked.
+    pub frames: usize,
+    /// Frames of the recording.
+    pub all_frames: usize,
+    /// Progress of the tracker.
+    pub tracking: TrackingProgress,
+    /// Progress of the mapper.
+    pub mapping: MappingProgress,
+    /// Frames a second, of the last seconds.
+    pub rate: f64,
+    /// Estimated seconds to the end, where they can be estimated.
+    pub left_s: Option<f64>,
+    /// Whether it is held.
+    pub paused: bool,
+}
+
+/// Estimates how long a run will take.
+#[derive(Debug)]
+pub struct Outlook {
+    started: Instant,
+    all_frames: usize,
+    /// Frames a second.
+    rate: f64,
+    /// Seconds and frames when it was measured.
+    last: Option<(f64, usize)>,
+}
+
+impl Outlook {
+    /// Of a run over so many frames that begins now.
+    pub fn new(all_frames: usize) -> Self {
+        Self { started: Instant::now(), all_frames, rate: 0.0, last: None }
+    }
+
+    /// Looks at the run; to be called every now and then.
+    pub fn look(&mut self, progress: &Progress) -> RunState {
+        let s = self.started.elapsed().as_secs_f64();
+        let tracking = progress.tracking().get().map(|tracking| *tracking).unwrap_or_default();
+        let mapping = progress.mapping().get().map(|mapping| *mapping).unwrap_or_default();
+        let frames = tracking.frames_done;
+        self.measure(s, frames);
+        let paused = progress.control().is_paused();
+        let left_s = self.left_s(frames, &mapping).filter(|_| !paused);
+        RunState { s, frames, all_frames: self.all_frames, tracking, mapping, rate: self.rate, left_s, paused }
+    }
+
+    fn measure(&mut self, s: f64, frames: usize) {
+        let (last_s, last_frames) = *self.last.get_or_insert((s, frames));
+        let seconds = s - last_s;
+        if seconds < 1.0 {
+            return;
+        }
+        let rate = (frames - last_frames) as f64 / seconds;
+        let weight = if self.rate > 0.0 { (seconds / RATE_SECONDS).min(1.0) } else { 1.0 };
+        self.rate += weight * (rate - self.rate);
+        self.last = Some((s, frames));
+    }
+
+    /// Frames that are left at the present rate; then the refinement's steps.
+    fn left_s(&self, frames: usize, mapping: &MappingProgress) -> Option<f64> {
+        match mapping.refinement {
+            Some((done, Some(planned))) => Some((planned - done) as f64 * mapping.step_ms / 1e3),
+            Some((_, None)) => None,
+            None => (self.rate > 0.0).then(|| self.all_frames.saturating_sub(frames) as f64 / self.rate),
+        }
+    }
+}
+
+impl RunState {
+    /// What matters of it, in a line: frames a second, keyframes, Gaussians, quality, time left, and whether the camera is lost.
+    pub fn line(&self) -> String {
+        let mut parts = vec![format!("{:.1}/s", self.rate), format!("{} keyframes", self.tracking.keyframes)];
+        if self.mapping.gaussians > 0 {
+            parts.push(format!("{} Gaussians", self.mapping.gaussians));
+            parts.push(format!("{:.1} dB", self.mapping.psnr_db));
+        }
+        if let Some((done, planned)) = self.mapping.refinement {
+            parts[0] = planned.map_or_else(|| format!("refining, step {done}"), |all| format!("refining, step {done}/{all}"));
+        }
+        parts.extend(self.left_s.map(|s| format!("{} left", duration(s))));
+        parts.extend(self.paused.then(|| "PAUSED".into()));
+        parts.extend(self.tracking.lost.then(|| "LOST".into()));
+        parts.join("  ")
+    }
+}
+
+fn duration(s: f64) -> String {
+    let s = s.round() as u64;
+    match (s / 3600, s / 60 % 60, s % 60) {
+        (0, 0, s) => format!("{s} s"),
+        (0, m, s) => format!("{m}:{s:02} min"),
+        (h, m, _) => format!("{h}:{m:02} h"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn time_left_is_that_of_the_frames_and_then_of_the_refinement() {
+        let mut outlook = Outlook::new(100);
+        outlook.measure(0.0, 0);
+        outlook.measure(2.0, 20);
+        let mapping = MappingProgress { gaussians: 5, psnr_db: 21.5, step_ms: 20.0, ..MappingProgress::default() };
+        assert_eq!(outlook.left_s(20, &mapping), Some(8.0));
+        let refining = MappingProgress { refinement: Some((50, Some(250))), ..mapping };
+        assert_eq!(outlook.left_s(100, &refining), Some(4.0));
+        assert_eq!(outlook.left_s(100, &MappingProgress { refinement: Some((50, None)), ..mapping }), None);
+        let state = RunState { rate: 10.0, mapping, left_s: Some(83.0), ..RunState::default() };
+        assert_eq!(state.line(), "10.0/s  0 keyframes  5 Gaussians  21.5 dB  1:23 min left");
+        let lost = TrackingProgress { lost: true, ..TrackingProgress::default() };
+        let refining = RunState { mapping: refining, tracking: lost, left_s: Some(7200.0), paused: true, ..state };
+        assert!(refining.line().starts_with("refining, step 50/250") && refining.line().ends_with("2:00 h left  PAUSED  LOST"));
+    }
+}

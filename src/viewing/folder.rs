@@ -1,0 +1,303 @@
+//! A finished run's folder, or a map alone, as a board for viewers.
+
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex};
+
+use nalgebra::{Point3, Vector3};
+use serde::de::DeserializeOwned;
+
+use super::board::{Board, Frames, History as Figures, put};
+use super::delivery::Delivery;
+use super::packing::PackedMap;
+use super::pictures::{self, RecordedImages};
+use super::protocol::{
+    CameraPath, CameraView, Command, Hello, KeyframeView, Outgoing, PROTOCOL, Phase, RenderRequest, Statistics, ToViewer,
+};
+use super::server::Desk;
+use crate::config::{Config, ConfigError};
+use crate::evaluation::{Comparison, MAX_TIME_DIFFERENCE_S, Metrics};
+use crate::export::{ExportError, MapFormat};
+use crate::geometry::{Trajectory, TrajectoryError, align};
+use crate::gpu::{Gpu, GpuError};
+use crate::recording::Recording;
+use crate::render::{GpuCloud, Rasterizer, Rendered};
+use crate::run_folder::{History, outputs};
+use crate::sequence::SensorKind;
+use crate::splat::{GaussianCloud, ViewCamera};
+
+/// The only one of files.
+const REVISION: u64 = 1;
+/// Poses of a path; longer ones are thinned.
+const MOST_POSES: usize = 20_000;
+
+/// Files that cannot be shown.
+#[derive(Debug, thiserror::Error)]
+pub enum ViewError {
+    /// Neither a run's folder nor a map.
+    #[error("{path} is no folder of a run and no map; give a folder that keysplat run wrote, or a map like map.ply")]
+    Nothing {
+        /// The path.
+        path: PathBuf,
+    },
+    /// The map cannot be read.
+    #[error(transparent)]
+    Map(#[from] ExportError),
+    /// A trajectory cannot be read.
+    #[error(transparent)]
+    Trajectory(#[from] TrajectoryError),
+}
+
+/// Files of a run, or a map alone, opened for viewing.
+pub struct Finished {
+    board: Arc<Board>,
+    desk: Arc<FolderDesk>,
+}
+
+/// Answers viewers from files.
+struct FolderDesk {
+    cloud: GaussianCloud,
+    recording: Option<Recording>,
+    images: Option<RecordedImages>,
+    keyframes: Vec<KeyframeView>,
+    adapter: Option<String>,
+    renderer: Mutex<Option<Renderer>>,
+}
+
+struct Renderer {
+    rasterizer: Rasterizer,
+    cloud: GpuCloud,
+}
+
+impl Finished {
+    /// Reads a run's folder, or a map.
+    ///
+    /// # Errors
+    /// [`ViewError`] if there is nothing to show, or a file of the run is damaged.
+    pub fn open(path: &Path) -> Result<Self, ViewError> {
+        let nothing = || ViewError::Nothing { path: path.into() };
+        if path.is_file() {
+            let format = MapFormat::of_path(path).ok_or_else(nothing)?;
+            let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+            return Ok(Self::new(Files { name, cloud: format.read(path)?, ..Files::default() }));
+        }
+        let (map, format) = outputs::find_map(path).ok_or_else(nothing)?;
+        let mut files = Files { cloud: format.read(&map)?, ..Files::default() };
+        files.read(path)?;
+        if files.name.is_empty() {
+            files.name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        }
+        Ok(Self::new(files))
+    }
+
+    fn new(files: Files) -> Self {
+        let images = files.recording.as_ref().filter(|r| RecordedImages::are_there(r)).map(RecordedImages::new);
+        let board = Board::new(files.hello(images.is_some()));
+        let keyframes = files.keyframe_views();
+        put(&board.map, PackedMap::new(&files.cloud, REVISION, None));
+        let loops = files.history.as_ref().map_or_else(Vec::new, |history| history.loops.clone());
+        put(&board.frames, Frames { keyframes: keyframes.clone(), loops, current: None });
+        put(&board.path, files.path());
+        board.statistics.store(Arc::new(files.statistics()));
+        let adapter = files.recording.as_ref().and_then(|r| r.config().adapter.clone());
+        let Files { cloud, recording, .. } = files;
+        let desk = FolderDesk { cloud, recording, images, keyframes, adapter, renderer: Mutex::new(None) };
+        Self { board: Arc::new(board), desk: Arc::new(desk) }
+    }
+
+    /// What a server shows.
+    pub fn board(&self) -> Arc<Board> {
+        self.board.clone()
+    }
+
+    /// What answers viewers.
+    pub fn desk(&self) -> Arc<dyn Desk> {
+        self.desk.clone()
+    }
+
+    /// All messages that a viewer gets, with the images of some keyframes: for a page that has no server.
+    pub fn messages(&self, images: usize) -> Vec<Outgoing> {
+        let hello = Hello { exact: false, images: false, ..self.board.hello.clone() };
+        let mut messages = vec![Outgoing::text(&ToViewer::Hello(&hello))];
+        let mut delivery = Delivery::default();
+        while let Some(message) = delivery.next(&self.board) {
+            messages.push(message);
+            delivery.taken(REVISION);
+        }
+        messages.extend(self.keyframe_images(images));
+        messages
+    }
+
+    /// The messages of the image of some keyframes, spread evenly; none where the recording is not there.
+    fn keyframe_images(&self, most: usize) -> Vec<Outgoing> {
+        let keyframes = &self.desk.keyframes;
+        let count = most.min(keyframes.len());
+        let chosen = (0..count).map(|k| keyframes[k * keyframes.len() / count].id);
+        chosen.filter_map(|id| self.desk.keyframe(id).ok()).collect()
+    }
+}
+
+/// What was read.
+#[derive(Default)]
+struct Files {
+    name: String,
+    cloud: GaussianCloud,
+    recording: Option<Recording>,
+    metrics: Option<Metrics>,
+    history: Option<History>,
+    comparison: Option<Comparison>,
+    trajectory: Trajectory,
+    keyframes: Trajectory,
+}
+
+impl Files {
+    fn read(&mut self, folder: &Path) -> Result<(), ViewError> {
+        let trajectory = |name: &str| {
+            let path = folder.join(name);
+            if path.is_file() { Trajectory::read_tum(&path) } else { Ok(Trajectory::default()) }
+        };
+        self.trajectory = trajectory(outputs::TRAJECTORY)?;
+        self.keyframes = trajectory(outputs::KEYFRAMES)?;
+        self.metrics = json(folder, outputs::METRICS);
+        self.history = json(folder, outputs::HISTORY);
+        self.comparison = json(folder, outputs::COMPARISON);
+        self.name = self.metrics.as_ref().map_or_else(String::new, |metrics| metrics.sequence.clone());
+        let config = folder.join(outputs::CONFIG);
+        let recording = Config::read(&config).map_err(|error: ConfigError| error.to_string());
+        let recording = recording.and_then(|config| Recording::open(config).map_err(|error| error.to_string()));
+        self.recording = recording.inspect_err(|why| tracing::warn!("recorded images are not shown: {why}")).ok();
+        Ok(())
+    }
+
+    fn hello(&self, images: bool) -> Hello {
+        let sensor = self.metrics.as_ref().map(|metrics| metrics.sensor);
+        let metric = sensor.is_some_and(|sensor| sensor != SensorKind::Mono);
+        Hello {
+            protocol: PROTOCOL,
+            name: self.name.clone(),
+            sensor: sensor.map(|sensor| sensor.to_string()),
+            live: false,
+            control: false,
+            exact: true,
+            images,
+            units: if metric { "metres" } else { "arbitrary" },
+            camera: self.recording.as_ref().map(|recording| CameraView::from(recording.map_pinhole())),
+            frames: self.metrics.as_ref().map(|metrics| metrics.frames as usize),
+        }
+    }
+
+    fn keyframe_views(&self) -> Vec<KeyframeView> {
+        let entries = self.recording.as_ref().map(|recording| &recording.sequence().entries);
+        let frame_at = |t: f64| {
+            let entries = entries?;
+            let after = entries.partition_point(|entry| entry.timestamp_s < t);
+            let near = [after.checked_sub(1), Some(after)].into_iter().flatten().filter(|i| *i < entries.len());
+            near.min_by(|a, b| (entries[*a].timestamp_s - t).abs().total_cmp(&(entries[*b].timestamp_s - t).abs()))
+        };
+        let view = |(place, pose): (usize, &crate::geometry::StampedPose)| KeyframeView {
+            id: place,
+            frame: frame_at(pose.timestamp_s).unwrap_or(place),
+            t: pose.timestamp_s,
+            pose: (&pose.world_from_camera).into(),
+        };
+        self.keyframes.poses.iter().enumerate().map(view).collect()
+    }
+
+    /// The camera's path in the map's world; errors and truth are brought there from the world of the truth.
+    fn path(&self) -> CameraPath {
+        let stride = self.trajectory.poses.len().div_ceil(MOST_POSES).max(1);
+        let compared = self.comparison.as_ref();
+        let error_at = |t: f64| {
+            let poses = &compared?.poses;
+            let place = poses.partition_point(|pose| pose.timestamp_s < t - MAX_TIME_DIFFERENCE_S);
+            poses.get(place).filter(|pose| (pose.timestamp_s - t).abs() <= MAX_TIME_DIFFERENCE_S)?.error_m
+        };
+        let pose = |pose: &crate::geometry::StampedPose| {
+            let [x, y, z] = pose.world_from_camera.translation.vector.into();
+            (pose.timestamp_s, x, y, z, error_at(pose.timestamp_s))
+        };
+        let poses = self.trajectory.poses.iter().step_by(stride).map(pose).collect();
+        CameraPath { poses, truth: self.truth().unwrap_or_default() }
+    }
+
+    fn truth(&self) -> Option<Vec<[f64; 3]>> {
+        let compared =
+            self.comparison.as_ref().filter(|c| !c.truth.is_empty() && c.poses.len() == self.trajectory.poses.len())?;
+        let from: Vec<Vector3<f64>> = compared.poses.iter().map(|pose| pose.position.into()).collect();
+        let to: Vec<Vector3<f64>> = self.trajectory.poses.iter().map(|pose| pose.world_from_camera.translation.vector).collect();
+        let map_from_truth = align(&from, &to, true)?;
+        let stride = compared.truth.len().div_ceil(MOST_POSES).max(1);
+        let truth = compared.truth.iter().step_by(stride);
+        Some(truth.map(|point| map_from_truth.act(&Point3::from(*point)).coords.into()).collect())
+    }
+
+    fn statistics(&self) -> Figures {
+        let mut figures = Figures::default();
+        let Some(history) = &self.history else { return figures };
+        let frames = self.metrics.as_ref().map_or(0, |metrics| metrics.frames_tracked as usize);
+        let mut steps = 0;
+        for (k, record) in history.keyframes.iter().enumerate() {
+            steps += record.report.iterations;
+            let is_last = k + 1 == history.keyframes.len();
+            figures.push(Statistics {
+                s: record.done_s,
+                phase: if is_last { Phase::Done } else { Phase::Tracking },
+                frames: if is_last { frames } else { frames * (k + 1) / history.keyframes.len() },
+                keyframes: k + 1,
+                gaussians: if is_last { self.cloud.len() } else { record.report.gaussians },
+                steps,
+                psnr_db: (record.report.iterations > 0).then_some(record.report.psnr_db),
+                host_bytes: record.host_bytes,
+                ..Statistics::default()
+            });
+        }
+        figures
+    }
+}
+
+/// A file of the run; `None` where it is missing or of another version, for the map can be shown without it.
+fn json<T: DeserializeOwned>(folder: &Path, name: &str) -> Option<T> {
+    let bytes = std::fs::read(folder.join(name)).ok()?;
+    serde_json::from_slice(&bytes).inspect_err(|error| tracing::warn!("{name} is not used: {error}")).ok()
+}
+
+impl FolderDesk {
+    fn recorded(&self, id: usize) -> Result<(usize, crate::sequence::RectifiedImage), String> {
+        let missing = "the recording of this run is not there";
+        let (recording, images) = self.recording.as_ref().zip(self.images.as_ref()).ok_or(missing)?;
+        let keyframe = self.keyframes.iter().find(|view| view.id == id).ok_or("there is no such keyframe")?;
+        Ok((keyframe.frame, images.load(recording, keyframe.frame)?))
+    }
+
+    fn draw(&self, camera: &ViewCamera) -> Result<Rendered, String> {
+        let mut renderer = self.renderer.lock().map_err(|_| "the rasterizer failed")?;
+        if renderer.is_none() {
+            *renderer = Some(self.open_renderer().map_err(|error| error.to_string())?);
+        }
+        let Renderer { rasterizer, cloud } = renderer.as_mut().expect("it was just opened");
+        rasterizer.render(cloud, camera, [0.0; 3]).map_err(|error| error.to_string())
+    }
+
+    fn open_renderer(&self) -> Result<Renderer, GpuError> {
+        let gpu = Gpu::open(self.adapter.as_deref())?;
+        let mut cloud = GpuCloud::new(&gpu, self.cloud.sh_degree, self.cloud.len())?;
+        cloud.append(&gpu, &self.cloud)?;
+        Ok(Renderer { rasterizer: Rasterizer::new(gpu)?, cloud })
+    }
+}
+
+impl Desk for FolderDesk {
+    fn keyframe(&self, id: usize) -> Result<Outgoing, String> {
+        let (frame, image) = self.recorded(id)?;
+        pictures::recorded(&image, id, frame)
+    }
+
+    fn render(&self, request: &RenderRequest) -> Result<Outgoing, String> {
+        let (pinhole, world_from_camera) = request.camera().ok_or("the camera is none")?;
+        let camera = ViewCamera { pinhole, camera_from_world: world_from_camera.inverse() };
+        let recorded = request.id.map(|id| self.recorded(id)).transpose()?.map(|(_, image)| image.color);
+        let same = recorded.filter(|image| image.dimensions() == (pinhole.width, pinhole.height));
+        pictures::rendered(&self.draw(&camera)?, request, same.as_ref())
+    }
+
+    fn control(&self, _: Command) {}
+}
