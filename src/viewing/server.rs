@@ -9,7 +9,8 @@ use std::time::Duration;
 
 use axum::Router;
 use axum::extract::{Extension, State, WebSocketUpgrade};
-use axum::http::{HeaderMap, StatusCode, Uri, header};
+use axum::http::{HeaderMap, HeaderValue, StatusCode, Uri, header};
+use axum::middleware::map_response;
 use axum::response::{Html, IntoResponse, Response};
 use axum::routing::get;
 use hyper::server::conn::http1;
@@ -191,7 +192,8 @@ async fn accept(listener: std::net::TcpListener, service: Arc<Service>) {
             return;
         }
     };
-    let router = Router::new().route("/", get(page_of)).route("/live", get(live)).with_state(service);
+    let router =
+        Router::new().route("/", get(page_of)).route("/live", get(live)).with_state(service).layer(map_response(last_answer));
     let room = Arc::new(Semaphore::new(MOST_CONNECTIONS));
     loop {
         let Ok((stream, peer)) = listener.accept().await else {
@@ -205,7 +207,7 @@ async fn accept(listener: std::net::TcpListener, service: Arc<Service>) {
         let answer = TowerToHyperService::new(router.clone().layer(Extension(peer)));
         tokio::spawn(async move {
             let mut http = http1::Builder::new();
-            http.timer(TokioTimer::new()).header_read_timeout(HEADER_TIME).keep_alive(false);
+            http.timer(TokioTimer::new()).header_read_timeout(HEADER_TIME);
             let connection = http.serve_connection(TokioIo::new(stream), answer).with_upgrades();
             let _ = timeout(ANSWER_TIME, connection).await;
             drop(permit);
@@ -249,6 +251,14 @@ async fn live(
         connection::attend(socket, &service, control).await;
         drop(seat);
     })
+}
+
+/// A connection has one answer, unless it becomes a socket.
+async fn last_answer(mut answer: Response) -> Response {
+    if answer.status() != StatusCode::SWITCHING_PROTOCOLS {
+        answer.headers_mut().insert(header::CONNECTION, HeaderValue::from_static("close"));
+    }
+    answer
 }
 
 fn refusal(why: &'static str) -> Response {

@@ -1,6 +1,7 @@
 //! What test binaries share: random scenes for the gradient tests, and a tiny recording for those of the whole program.
 #![allow(dead_code, reason = "each test binary uses its own part")]
 
+pub mod browser;
 pub mod pairs;
 pub mod recording;
 pub mod requirements;

@@ -13,3 +13,4 @@ mod quality;
 mod report;
 mod resume;
 mod sweep;
+mod viewing;

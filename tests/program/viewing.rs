@@ -1,0 +1,403 @@
+//! The view of a run as its viewers have it: polite ones, hostile ones, and a browser.
+
+use std::collections::BTreeMap;
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::{SocketAddr, TcpStream};
+use std::path::Path;
+use std::process::Child;
+use std::time::{Duration, Instant};
+
+use keysplat::export::MapFormat;
+use keysplat::geometry::Trajectory;
+use keysplat::gpu::Gpu;
+use keysplat::render::{GpuCloud, Rasterizer};
+use keysplat::splat::ViewCamera;
+use keysplat::viewing::PackedMap;
+use keysplat::{Config, Recording};
+use serde_json::{Value, json};
+use tungstenite::stream::MaybeTlsStream;
+use tungstenite::{Message, WebSocket};
+
+use crate::common::browser::{Page, chromium};
+use crate::common::recording::{
+    FRAMES, finish, finish_child, keysplat, metrics, recording, run_command, scratch, skipped_without_adapter,
+};
+
+const HANGS_AFTER: Duration = Duration::from_secs(120);
+/// Words of a Gaussian but for the harmonics, whose scale is that of their part.
+const BASE_WORDS: usize = 8;
+
+/// A program that serves a view.
+struct Serving {
+    child: Child,
+    said: String,
+    address: SocketAddr,
+    url: String,
+}
+
+impl Serving {
+    fn start(mut command: std::process::Command) -> Self {
+        let mut child = command.spawn().unwrap();
+        let mut stdout = BufReader::new(child.stdout.take().unwrap());
+        let mut line = String::new();
+        stdout.read_line(&mut line).unwrap();
+        let url = line.trim().strip_prefix("The view is at ").unwrap_or_else(|| panic!("no address: {line}")).to_owned();
+        let address = url.strip_prefix("http://").unwrap().split('/').next().unwrap().parse().unwrap();
+        // The table that follows is not read here, and is shorter than the pipe.
+        std::mem::forget(stdout);
+        Self { child, said: line, address, url }
+    }
+
+    /// `keysplat view` of a finished run.
+    fn view(path: &Path) -> Self {
+        let mut command = keysplat(["view", "--at", "127.0.0.1:0"]);
+        command.arg(path);
+        Self::start(command)
+    }
+
+    fn token(&self) -> &str {
+        self.url.split("token=").nth(1).unwrap()
+    }
+
+    /// The status line and the rest of an answer to a request that is written as it is.
+    fn ask(&self, request: &str) -> String {
+        let mut stream = TcpStream::connect(self.address).unwrap();
+        stream.set_read_timeout(Some(HANGS_AFTER)).unwrap();
+        stream.write_all(request.replace("HOST", &self.address.to_string()).as_bytes()).unwrap();
+        let mut answer = Vec::new();
+        let _ = stream.read_to_end(&mut answer);
+        String::from_utf8_lossy(&answer).into_owned()
+    }
+}
+
+impl Drop for Serving {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// A viewer that takes what it gets.
+struct Viewer {
+    socket: WebSocket<MaybeTlsStream<TcpStream>>,
+    parts: BTreeMap<(Vec<i64>, u64), Vec<u32>>,
+    updates: usize,
+    keyframes: BTreeMap<u64, Value>,
+    statistics: Vec<Value>,
+    images: Vec<Value>,
+    complete: bool,
+}
+
+fn open(serving: &Serving) -> WebSocket<MaybeTlsStream<TcpStream>> {
+    let address = serving.url.replace("http:", "ws:").replace("/?", "/live?");
+    let (socket, _) = tungstenite::connect(&address).unwrap();
+    if let MaybeTlsStream::Plain(stream) = socket.get_ref() {
+        stream.set_read_timeout(Some(HANGS_AFTER)).unwrap();
+    }
+    socket
+}
+
+impl Viewer {
+    fn new(serving: &Serving) -> Self {
+        let mut viewer = Self {
+            socket: open(serving),
+            parts: BTreeMap::new(),
+            updates: 0,
+            keyframes: BTreeMap::new(),
+            statistics: Vec::new(),
+            images: Vec::new(),
+            complete: false,
+        };
+        let hello = viewer.take();
+        assert_eq!((hello["type"].as_str(), hello["protocol"].as_u64()), (Some("hello"), Some(1)), "{hello}");
+        viewer
+    }
+
+    fn send(&mut self, message: &Value) {
+        self.socket.send(Message::text(message.to_string())).unwrap();
+    }
+
+    /// Takes in one message and returns its object.
+    fn take(&mut self) -> Value {
+        let (value, payload) = loop {
+            match self.socket.read().unwrap() {
+                Message::Text(text) => break (serde_json::from_str::<Value>(&text).unwrap(), Vec::new()),
+                Message::Binary(bytes) => {
+                    let header = u32::from_le_bytes(bytes[..4].try_into().unwrap()) as usize;
+                    assert!(bytes.len() <= 4 << 20 && header % 4 == 0);
+                    break (serde_json::from_slice(&bytes[4..4 + header]).unwrap(), bytes[4 + header..].to_vec());
+                }
+                _ => {}
+            }
+        };
+        match value["type"].as_str().unwrap() {
+            "map" => self.take_map(&value, &payload),
+            "statistics" => self.statistics.extend(value["entries"].as_array().unwrap().iter().cloned()),
+            "image" => {
+                image::load_from_memory(&payload).unwrap();
+                self.images.push(value.clone());
+            }
+            "poses" => {
+                if value["all"] == true {
+                    self.keyframes.clear();
+                }
+                let keyframes = value["keyframes"].as_array().unwrap();
+                self.keyframes.extend(keyframes.iter().map(|k| (k["id"].as_u64().unwrap(), k.clone())));
+            }
+            _ => {}
+        }
+        value
+    }
+
+    fn take_map(&mut self, header: &Value, payload: &[u8]) {
+        self.updates += 1;
+        if header["reset"] == true {
+            self.parts.clear();
+        }
+        let words_each = BASE_WORDS + 4 * header["sh_degree"].as_u64().unwrap() as usize;
+        let mut words = payload.chunks_exact(4).map(|word| u32::from_le_bytes(word.try_into().unwrap()));
+        for chunk in header["chunks"].as_array().unwrap() {
+            let at = chunk["at"].as_array().unwrap().iter().map(|c| c.as_i64().unwrap()).collect();
+            let key = (at, chunk["part"].as_u64().unwrap());
+            let count = chunk["count"].as_u64().unwrap() as usize;
+            let taken: Vec<u32> = words.by_ref().take(count * words_each).collect();
+            assert_eq!(taken.len(), count * words_each);
+            let base = taken.chunks(words_each).flat_map(|gaussian| gaussian[..BASE_WORDS].to_vec()).collect();
+            if count == 0 { drop(self.parts.remove(&key)) } else { drop(self.parts.insert(key, base)) }
+        }
+        assert!(words.next().is_none());
+        self.complete = header["complete"] == true;
+        if self.complete {
+            assert_eq!(self.gaussians() as u64, header["gaussians"].as_u64().unwrap());
+        }
+        self.send(&json!({ "type": "taken", "revision": header["revision"] }));
+    }
+
+    fn gaussians(&self) -> usize {
+        self.parts.values().map(|words| words.len() / BASE_WORDS).sum()
+    }
+
+    /// Takes messages until a condition holds.
+    fn until(&mut self, what: &str, holds: impl Fn(&Self) -> bool) {
+        let started = Instant::now();
+        while !holds(self) {
+            self.take();
+            assert!(started.elapsed() < HANGS_AFTER, "{what} never came; {:?}", self.statistics.last());
+        }
+    }
+
+    fn is_done(&self) -> bool {
+        self.statistics.last().is_some_and(|entry| entry["phase"] == "done")
+    }
+}
+
+/// Sum of the base words of a map's Gaussians.
+fn sum<'a>(words: impl Iterator<Item = &'a u32>) -> u32 {
+    words.fold(0, |sum, word| sum.wrapping_add(*word))
+}
+
+fn sum_of_file(path: &Path) -> (usize, u32) {
+    let packed = PackedMap::new(&MapFormat::default().read(path).unwrap(), 1, None);
+    let stride = BASE_WORDS + 4 * usize::from(packed.sh_degree.get());
+    let base = packed.parts.iter().flat_map(|part| part.words.chunks(stride).flat_map(|gaussian| &gaussian[..BASE_WORDS]));
+    (packed.gaussians, sum(base))
+}
+
+/// Random bytes, damaged messages and frames that are too large, in turn; a connection that was closed is opened again.
+fn torment(serving: &Serving, messages: usize) {
+    let mut random = fastrand::Rng::with_seed(5);
+    let good = [
+        r#"{"type":"taken","revision":1}"#,
+        r#"{"type":"keyframe","id":0}"#,
+        r#"{"type":"images","current":true}"#,
+        r#"{"type":"render","request":1,"kind":"color","p":[0,0,0],"q":[0,0,0,1],"width":64,"height":48,"fx":60,"fy":60,"cx":31,"cy":23}"#,
+    ];
+    let mut socket = None;
+    for number in 0..messages {
+        let mut bytes = good[random.usize(..good.len())].as_bytes().to_vec();
+        for _ in 0..random.usize(..4) {
+            let at = random.usize(..bytes.len());
+            bytes[at] = random.u8(32..127);
+        }
+        bytes.truncate(random.usize(..=bytes.len()));
+        let message = match number % 100 {
+            0 => Message::binary(vec![0u8; 100_000]),
+            1 => Message::text("x".repeat(5_000)),
+            2..10 => Message::binary((0..random.usize(..900)).map(|_| random.u8(..)).collect::<Vec<u8>>()),
+            _ => Message::text(String::from_utf8(bytes).unwrap()),
+        };
+        let open = socket.get_or_insert_with(|| try_open(serving));
+        if !open.as_mut().is_some_and(|open| open.send(message).is_ok()) {
+            socket = None;
+        }
+    }
+}
+
+fn try_open(serving: &Serving) -> Option<WebSocket<MaybeTlsStream<TcpStream>>> {
+    let address = serving.url.replace("http:", "ws:").replace("/?", "/live?");
+    tungstenite::connect(&address).ok().map(|(socket, _)| socket)
+}
+
+/// Viewers that take all, never read, or attack change neither the map nor the run's end; the map seen last is the file's.
+#[test]
+fn viewers_see_the_map_grow_and_change_nothing() {
+    if skipped_without_adapter() {
+        return;
+    }
+    let (alone, seen) = (scratch().join("alone"), scratch().join("seen"));
+    finish(run_command(recording(), &alone, &[])).succeeded();
+    let mut serving = Serving::start(run_command(recording(), &seen, &["--view=127.0.0.1:0"]));
+    let mut viewer = Viewer::new(&serving);
+    viewer.send(&json!({ "type": "control", "do": "pause" }));
+    viewer.send(&json!({ "type": "images", "current": true }));
+    let mute = open(&serving);
+    viewer.until("the pause", |viewer| viewer.statistics.last().is_some_and(|entry| entry["paused"] == true));
+    let slow: Vec<TcpStream> = (0..20)
+        .map(|_| {
+            let mut stream = TcpStream::connect(serving.address).unwrap();
+            stream.write_all(b"GET / HTTP/1.1\r\nHost").unwrap();
+            stream
+        })
+        .collect();
+    let many: Vec<TcpStream> = (0..200).filter_map(|_| TcpStream::connect(serving.address).ok()).collect();
+    drop(many);
+    torment(&serving, 10_000);
+    for step in ["step", "step", "go"] {
+        viewer.send(&json!({ "type": "control", "do": step }));
+        std::thread::sleep(Duration::from_millis(300));
+    }
+    let (p, q) = ([0.0; 3], [0.0, 0.0, 0.0, 1.0]);
+    viewer.send(&json!({ "type": "render", "request": 9, "kind": "depth", "p": p, "q": q,
+        "width": 200, "height": 150, "fx": 150, "fy": 150, "cx": 99.5, "cy": 74.5 }));
+    viewer.until("the end", |viewer| viewer.is_done() && viewer.complete);
+    let settled = Instant::now();
+    let (gaussians, expected) = sum_of_file(&seen.join("map.ply"));
+    viewer.until("the last map", |viewer| viewer.gaussians() == gaussians || settled.elapsed() > HANGS_AFTER);
+    viewer.until("the last map's values", |viewer| sum(viewer.parts.values().flatten()) == expected);
+    assert!(viewer.updates >= 3, "{} updates", viewer.updates);
+    assert_eq!(viewer.keyframes.len() as u64, metrics(&seen).keyframes.unwrap());
+    assert!(viewer.images.iter().any(|image| image["of"] == "render" && image["kind"] == "depth"), "{:?}", viewer.images);
+    viewer.send(&json!({ "type": "keyframe", "id": 0 }));
+    viewer.until("a keyframe's image", |viewer| viewer.images.iter().any(|image| image["of"] == "keyframe"));
+    drop((viewer, mute, slow));
+    let child = std::mem::replace(&mut serving.child, keysplat(["--version"]).spawn().unwrap());
+    finish_child(child, std::mem::take(&mut serving.said)).succeeded();
+    let hash = |out: &Path| metrics(out).map_hash.unwrap();
+    assert_eq!(hash(&alone), hash(&seen));
+    assert_eq!(metrics(&seen).frames, FRAMES as u64);
+}
+
+#[test]
+fn strangers_are_refused() {
+    let map = scratch().join("map.ply");
+    MapFormat::default().write(&crate::common::scene(&mut fastrand::Rng::with_seed(2), 50, Default::default()), &map).unwrap();
+    let serving = Serving::view(&map);
+    let token = serving.token();
+    let get = |path: &str, more: &str| serving.ask(&format!("GET {path} HTTP/1.1\r\nHost: HOST\r\n{more}\r\n"));
+    let status = |answer: &str| answer.split(' ').nth(1).unwrap_or_default().to_owned();
+    let upgrade = "Connection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n\
+                   Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n";
+    let page = get(&format!("/?token={token}"), "");
+    assert_eq!(status(&page), "200");
+    assert!(page.to_lowercase().contains("content-security-policy: default-src 'none'"));
+    for path in ["/", "/?token=", "/?token=0123", "/live"] {
+        assert_eq!(status(&get(path, upgrade)), "403", "{path}");
+    }
+    let foreign = get(&format!("/live?token={token}"), &format!("{upgrade}Origin: http://example.org\r\n"));
+    assert_eq!(status(&foreign), "403");
+    for path in ["/../../etc/passwd", "/..%2f..%2fetc/passwd", "//etc/passwd", "/map.ply", "/?token"] {
+        let answer = get(&format!("{path}{}", if path.contains('?') { "" } else { "?token=TOKEN" }).replace("TOKEN", token), "");
+        assert!(["404", "403", "400"].contains(&status(&answer).as_str()), "{path}: {answer}");
+    }
+    let posted = serving.ask(&format!("POST /?token={token} HTTP/1.1\r\nHost: HOST\r\nContent-Length: 0\r\n\r\n"));
+    assert_eq!(status(&posted), "405");
+    let huge = get("/", &format!("X: {}\r\n", "y".repeat(1 << 20)));
+    assert!(["431", "400", ""].contains(&status(&huge).as_str()), "{}", status(&huge));
+    let mut viewer = Viewer::new(&serving);
+    viewer.until("the map", |viewer| viewer.gaussians() == 50);
+    viewer.send(&json!({ "type": "control", "do": "finish" }));
+    let answer = std::iter::from_fn(|| Some(viewer.take())).find(|value| value["type"] == "refused").unwrap();
+    assert!(answer["why"].as_str().unwrap().contains("read only"), "{answer}");
+}
+
+#[test]
+fn what_is_no_run_is_refused() {
+    let empty = scratch().join("empty");
+    std::fs::create_dir_all(&empty).unwrap();
+    finish(keysplat(["view".as_ref(), empty.as_os_str()])).refused(&["empty is no folder of a run and no map"]);
+    finish(keysplat(["view", "nowhere.ply"])).refused(&["nowhere.ply"]);
+    let cut = scratch().join("cut.ply");
+    std::fs::write(&cut, "ply\nformat binary_little_endian 1.0\n").unwrap();
+    finish(keysplat(["view".as_ref(), cut.as_os_str()])).refused(&["cut.ply"]);
+    let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let (map, address) = (scratch().join("one.ply"), taken.local_addr().unwrap().to_string());
+    MapFormat::default().write(&crate::common::scene(&mut fastrand::Rng::with_seed(2), 5, Default::default()), &map).unwrap();
+    finish(keysplat(["view".as_ref(), map.as_os_str(), "--at".as_ref(), address.as_ref()])).refused(&[&address, "another"]);
+}
+
+/// PSNR of bytes, three of each four.
+fn psnr(a: &[u8], b: &[u8]) -> f64 {
+    let differences = a.chunks(4).zip(b.chunks(4)).flat_map(|(a, b)| (0..3).map(|c| f64::from(a[c]) - f64::from(b[c])));
+    let squares: Vec<f64> = differences.map(|d| d * d).collect();
+    10.0 * (255.0 * 255.0 * squares.len() as f64 / squares.iter().sum::<f64>().max(1e-9)).log10()
+}
+
+/// The page draws what our rasterizer draws, from a server and from a report's file; by keyboard, on a phone and on a desk.
+#[test]
+fn a_browser_draws_the_map_as_we_do() {
+    if skipped_without_adapter() {
+        return;
+    }
+    let Some(program) = chromium() else { return };
+    let out = scratch().join("shown");
+    finish(run_command(recording(), &out, &[])).succeeded();
+    finish(keysplat(["report".as_ref(), out.as_os_str()])).succeeded();
+    let serving = Serving::view(&out);
+    let mut page = Page::open(program, &scratch().join("profile"));
+    let cloud = MapFormat::default().read(&out.join("map.ply")).unwrap();
+    let recording = Recording::open(Config::read(&out.join("config.toml")).unwrap()).unwrap();
+    let pinhole = recording.map_pinhole();
+    let keyframes = Trajectory::read_tum(&out.join("keyframes.txt")).unwrap().poses;
+    let gpu = Gpu::open(None).unwrap();
+    let mut map = GpuCloud::new(&gpu, cloud.sh_degree, cloud.len()).unwrap();
+    map.append(&gpu, &cloud).unwrap();
+    let mut rasterizer = Rasterizer::new(gpu).unwrap();
+    let report = format!("file://{}", std::fs::canonicalize(out.join("report.html")).unwrap().display());
+    for (address, width, height, dark) in [(serving.url.as_str(), 1400, 900, false), (&report, 390, 844, true)] {
+        page.window(width, height, dark);
+        page.go(address);
+        page.wait_until("window.keysplat !== undefined");
+        page.wait_until(&format!("window.keysplat.state().gaussians === {}", cloud.len()));
+        page.evaluate("window.keysplat.settled()");
+        let digest = PackedMap::new(&cloud, 1, None).digest();
+        assert_eq!(page.evaluate("window.keysplat.state().digest"), digest);
+        assert_eq!(page.evaluate("window.keysplat.state().keyframes"), keyframes.len());
+        assert_eq!(page.evaluate("document.documentElement.scrollWidth <= innerWidth"), true, "{width}");
+        for pose in keyframes.iter().step_by(keyframes.len().div_ceil(3)) {
+            let world_from_camera = pose.world_from_camera;
+            let (p, q) = (world_from_camera.translation.vector, world_from_camera.rotation.coords);
+            let view = json!({ "p": [p.x, p.y, p.z], "q": [q.x, q.y, q.z, q.w], "camera": {
+                "width": pinhole.width, "height": pinhole.height,
+                "fx": pinhole.fx, "fy": pinhole.fy, "cx": pinhole.cx, "cy": pinhole.cy } });
+            let drawn = page.evaluate(&format!("window.keysplat.draw({view}).then(picture => Array.from(picture.rgba))"));
+            let drawn: Vec<u8> = drawn.as_array().unwrap().iter().map(|v| v.as_u64().unwrap() as u8).collect();
+            let camera = ViewCamera { pinhole, camera_from_world: world_from_camera.inverse() };
+            let ours = rasterizer.render(&map, &camera, [0.0; 3]).unwrap();
+            let byte = |v: f32| (v.clamp(0.0, 1.0) * 255.0).round() as u8;
+            let ours: Vec<u8> = ours.color_depth.iter().flat_map(|p| [byte(p[0]), byte(p[1]), byte(p[2]), 255]).collect();
+            assert_eq!(ours.len(), drawn.len());
+            assert!(psnr(&drawn, &ours) > 30.0, "{} dB", psnr(&drawn, &ours));
+        }
+        page.screenshot(&scratch().join(format!("page-{width}.png")));
+        let steps = |page: &mut Page| page.press("]", "BracketRight", 221);
+        page.evaluate("document.querySelector('#viewer canvas').focus()");
+        steps(&mut page);
+        page.wait_until("[...document.querySelectorAll('#viewer .compare')].some(element => !element.hidden)");
+        page.press("Escape", "Escape", 27);
+        page.wait_until("[...document.querySelectorAll('#viewer .compare')].every(element => element.hidden)");
+        page.press("?", "Slash", 191);
+        page.wait_until("document.querySelector('#viewer dialog[open]') !== null");
+        page.press("Escape", "Escape", 27);
+        assert!(page.complaints.is_empty(), "{:?}", page.complaints);
+    }
+}
