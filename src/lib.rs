@@ -9,6 +9,7 @@ pub mod config;
 pub mod evaluation;
 pub mod export;
 pub mod files;
+pub mod film;
 pub mod geometry;
 pub mod gpu;
 pub mod inspection;

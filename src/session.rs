@@ -222,7 +222,7 @@ impl Session {
     /// # Errors
     /// If nothing was tracked, nothing could be written, or the replay ended early; in the last case its partial result has been written.
     pub fn finish(&self, replay: Replay, on_view: &dyn Fn(usize)) -> Result<Metrics, SessionError> {
-        let Replay { result, error, stopped } = replay;
+        let Replay { result, error, stopped, .. } = replay;
         if result.poses.is_empty() {
             return Err(self.nothing_made(error, stopped));
         }

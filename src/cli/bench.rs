@@ -93,7 +93,7 @@ impl From<Form> for BlendForm {
     }
 }
 
-fn parse_size(text: &str) -> Result<(u32, u32), String> {
+pub fn parse_size(text: &str) -> Result<(u32, u32), String> {
     let wrong = || format!("`{text}` is no size; write WIDTHxHEIGHT, like 640x480");
     let (width, height) = text.split_once('x').ok_or_else(wrong)?;
     let number = |part: &str| part.parse().ok().filter(|n| (16..=4096).contains(n)).ok_or_else(wrong);

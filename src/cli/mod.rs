@@ -8,6 +8,7 @@ mod demo;
 mod eval;
 mod generate;
 mod progress;
+mod render;
 mod report;
 mod resume;
 mod run;
@@ -62,6 +63,8 @@ enum Command {
     Eval(eval::EvalArgs),
     /// Draw a finished run as one HTML file that needs nothing else.
     Report(report::ReportArgs),
+    /// Render a moving picture of a finished run's map.
+    Render(render::RenderArgs),
     /// Show a finished run, or a map, in a browser.
     View(view::ViewArgs),
     /// Measure speed.
@@ -111,6 +114,7 @@ fn execute(command: Command, verbosity: Verbosity) -> miette::Result<()> {
         Command::Generate(args) => generate::generate(&args, verbosity),
         Command::Eval(args) => eval::eval(&args, verbosity),
         Command::Report(args) => report::report(&args, verbosity),
+        Command::Render(args) => render::render(&args, verbosity),
         Command::View(args) => view::view(&args, verbosity),
         Command::Bench(args) => bench::bench(&args, verbosity),
         Command::Stress(args) => stress::stress(&args),

@@ -9,10 +9,10 @@ use clap::Args;
 use indicatif::ProgressBar;
 use keysplat::config::SequenceConfig;
 use keysplat::export::MapFormat;
-use keysplat::pipeline::Outlook;
+use keysplat::pipeline::{Outlook, Replay};
 use keysplat::presets::{self, Preset};
 use keysplat::sequence::{ASSUMED_CAMERA, is_camera_file};
-use keysplat::{Config, Gpu, Progress, Recording, Session, SessionError};
+use keysplat::{Config, Gpu, Metrics, Progress, Recording, Session, SessionError};
 use miette::{IntoDiagnostic, miette};
 
 use super::calibrate::{self, find_camera};
@@ -189,22 +189,41 @@ pub fn replay(mut session: Session, view: &ViewOptions, verbosity: Verbosity) ->
     let viewed = view.start(&session, &progress, verbosity)?;
     progress::stop_on_ctrl_c(&progress)?;
     let frames = session.recording().sequence().entries.len() as u64;
-    let done = AtomicBool::new(false);
-    let replayed = std::thread::scope(|scope| {
-        let bar = progress::bar(verbosity, frames, "{wide_bar} {pos}/{len} frames  {msg}");
-        let (progress, done) = (&progress, &done);
-        scope.spawn(move || show(progress, &bar, done));
-        let replayed = session.run(progress);
-        done.store(true, Ordering::Relaxed);
-        replayed
-    })
-    .into_diagnostic()?;
-    let bar = progress::bar(verbosity, replayed.result.poses.len() as u64, "{wide_bar} {pos}/{len} views compared");
-    viewed.iter().for_each(Viewed::measuring);
-    let finished = session.finish(replayed, &|views| bar.set_position(views as u64));
-    bar.finish_and_clear();
-    drop(session);
-    let ended = match finished {
+    let shown = |work: &mut dyn FnMut() -> Result<Replay, SessionError>| {
+        let done = AtomicBool::new(false);
+        std::thread::scope(|scope| {
+            let bar = progress::bar(verbosity, frames, "{wide_bar} {pos}/{len} frames  {msg}");
+            let (progress, done) = (&progress, &done);
+            scope.spawn(move || show(progress, &bar, done));
+            let replayed = work();
+            done.store(true, Ordering::Relaxed);
+            replayed
+        })
+    };
+    let mut replayed = shown(&mut || session.run(&progress)).into_diagnostic()?;
+    loop {
+        viewed.iter().for_each(Viewed::measuring);
+        let mut kept = replayed.kept.take().map(|kept| (kept, replayed.result.clone()));
+        let bar = progress::bar(verbosity, replayed.result.poses.len() as u64, "{wide_bar} {pos}/{len} views compared");
+        let finished = session.finish(replayed, &|views| bar.set_position(views as u64));
+        bar.finish_and_clear();
+        print_end(finished, verbosity)?;
+        let mapper = kept.as_mut().map(|(mapper, _)| mapper);
+        let Some(viewed) = viewed.as_ref().filter(|viewed| viewed.wants_more(&progress, mapper)) else { return Ok(()) };
+        let Some((mut kept, mut result)) = kept else { return Ok(()) };
+        viewed.refining();
+        let mut refine = || {
+            let error = kept.refine_on(&mut result, &progress).err();
+            Ok(Replay { result: result.clone(), error, kept: None, stopped: false })
+        };
+        replayed = shown(&mut refine).into_diagnostic()?;
+        replayed.kept = Some(kept);
+    }
+}
+
+/// Prints the figures of a run, and its error if it ended in one.
+fn print_end(finished: Result<Metrics, SessionError>, verbosity: Verbosity) -> miette::Result<()> {
+    match finished {
         Ok(metrics) => print_metrics(&metrics, verbosity),
         Err(SessionError::Stopped) => {
             tracing::warn!("{}", SessionError::Stopped);
@@ -216,11 +235,7 @@ pub fn replay(mut session: Session, view: &ViewOptions, verbosity: Verbosity) ->
             }
             Err(error).into_diagnostic()
         }
-    };
-    if let Some(viewed) = viewed.filter(|_| ended.is_ok()) {
-        viewed.stay_while_watched(&progress);
     }
-    ended
 }
 
 /// Keeps the bar up to date until the run is done.

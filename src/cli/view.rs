@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use clap::Args;
+use keysplat::pipeline::KeptMapper;
 use keysplat::viewing::{DEFAULT_ADDRESS, Finished, Live, Server, ServerOptions};
 use keysplat::{Progress, Session};
 use miette::IntoDiagnostic;
@@ -76,6 +77,7 @@ impl ViewOptions {
     /// Shows a session's run, if that is wanted.
     pub fn start(&self, session: &Session, progress: &Progress, verbosity: Verbosity) -> miette::Result<Option<Viewed>> {
         let Some(address) = self.view else { return Ok(None) };
+        progress.control().keep_mapper();
         let live = Live::start(session.shared_recording(), progress.clone()).into_diagnostic()?;
         let options = ServerOptions { address, remote_control: self.view_control };
         let server = Server::start(options, live.board(), live.desk()).into_diagnostic()?;
@@ -90,22 +92,37 @@ impl Viewed {
         self.live.measuring();
     }
 
-    /// Serves a run that is over for as long as somebody looks, or until Ctrl-C.
-    pub fn stay_while_watched(&self, progress: &Progress) {
+    /// The refinement goes on after the run's end.
+    pub fn refining(&self) {
+        self.live.refining();
+    }
+
+    /// Serves a run that is over for as long as somebody looks, or until Ctrl-C; whether a viewer wants the refinement to go on.
+    pub fn wants_more(&self, progress: &Progress, mut kept: Option<&mut KeptMapper>) -> bool {
         self.live.done();
+        let control = progress.control();
         if self.live.viewers() == 0 {
-            return;
+            return false;
         }
         tracing::info!("all results are written; the view stays open while somebody looks, or until Ctrl-C");
+        control.refine_on(false);
         let was_stopped = progress.stopped();
         let is_interrupted = || progress.stopped() && !was_stopped;
         let mut last_seen = Instant::now();
         while last_seen.elapsed() < GONE_AFTER && !is_interrupted() {
+            if control.refines_on() {
+                control.restart();
+                return true;
+            }
+            if let Some(kept) = &mut kept {
+                kept.attend(progress);
+            }
             if self.live.viewers() > 0 {
                 last_seen = Instant::now();
             }
             std::thread::sleep(LOOK_EVERY);
         }
+        false
     }
 }
 

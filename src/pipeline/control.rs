@@ -14,6 +14,7 @@ pub struct Control {
     /// Pause again after the next keyframe or round of the refinement.
     stepping: AtomicBool,
     refining_on: AtomicBool,
+    keeping: AtomicBool,
 }
 
 impl Control {
@@ -25,6 +26,21 @@ impl Control {
     /// Whether the run is to end early.
     pub fn is_stopped(&self) -> bool {
         self.stopped.load(Ordering::Relaxed)
+    }
+
+    /// Takes a stop back, so that the refinement of a finished run can go on.
+    pub fn restart(&self) {
+        self.stopped.store(false, Ordering::Relaxed);
+    }
+
+    /// Keeps the mapper beyond the run's end.
+    pub fn keep_mapper(&self) {
+        self.keeping.store(true, Ordering::Relaxed);
+    }
+
+    /// Whether the mapper is kept beyond the run's end.
+    pub(super) fn keeps_mapper(&self) -> bool {
+        self.keeping.load(Ordering::Relaxed)
     }
 
     /// Holds the run before its next frame and its next batch of steps.

@@ -1,23 +1,22 @@
 //! The mapping thread: maps keyframes as they arrive, refines the map after the last one, and publishes a snapshot after each.
 
 use std::cell::RefCell;
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use crossbeam::channel::{Receiver, RecvTimeoutError};
 
 use super::attending::Attending;
-use super::progress::{MappingProgress, guarded};
+use super::progress::guarded;
 use super::read_thread::QueuedFrame;
+use super::refining::{Checkpoints, KeptMapper, Refining, Round, figures, step_ms};
 use super::{PipelineError, Progress};
 use crate::evaluation::machine;
 use crate::gpu::Gpu;
-use crate::mapping::{
-    FinalRefinement, Interlude, KeyframeId, KeyframeReport, Mapper, MapperMessage, MappingConfig, MappingError,
-};
+use crate::mapping::{FinalRefinement, Interlude, KeyframeReport, Mapper, MapperMessage, MappingConfig, MappingError};
 use crate::run_folder::{CheckpointError, Checkpointer, KeyframeRecord, RunState};
-use crate::splat::{Exposure, GaussianCloud};
+use crate::splat::GaussianCloud;
 
 /// Real time: the mapper pauses between two batches of steps while more frames than this wait for the tracker,
 const MOST_WAITING: usize = 2;
@@ -34,25 +33,11 @@ pub(super) struct MapSummary {
     pub keyframes: Vec<KeyframeRecord>,
     /// Duration of each optimisation step, milliseconds.
     pub step_ms: Vec<f64>,
+    /// Where the refinement may go on.
+    pub kept: Option<KeptMapper>,
     /// The thread ended before it reached its checkpoint; there is nothing to write.
     pub behind: bool,
     pub error: Option<PipelineError>,
-}
-
-/// The map after a round of its refinement.
-pub(super) struct Round<'a> {
-    mapper: &'a mut Mapper,
-    attending: &'a Attending<'a>,
-    /// All optimisation steps so far.
-    pub steps: usize,
-}
-
-impl Round<'_> {
-    /// The map; `None` where the device fails, which the next step reports.
-    pub fn cloud(&mut self) -> Option<Arc<GaussianCloud>> {
-        self.attending.download(self.mapper).ok()?;
-        Some(self.attending.cloud())
-    }
 }
 
 /// Input of the mapping thread.
@@ -86,7 +71,7 @@ impl MapThread<'_> {
             Err(error) => return MapSummary { behind, error: Some(error), ..MapSummary::default() },
         };
         let mut summary = MapSummary { keyframes: records, ..MapSummary::default() };
-        let mut checkpoints = Checkpoints { checkpointer, failed: false };
+        let mut checkpoints = Checkpoints::new(checkpointer);
         let attending = Attending::new(self.progress, cloud);
         let mapped = self.map_messages(&mut mapper, &mut summary, &attending, &mut checkpoints);
         summary.error = mapped.err();
@@ -97,15 +82,42 @@ impl MapThread<'_> {
             summary.error = Some(MappingError::NoDepth.into());
         }
         if summary.error.is_none() {
-            let mut refining = Refining { thread: &self, attending: &attending, checkpoints: &mut checkpoints };
-            let refined = guarded("mapping", || refining.refine(&mut mapper, &mut summary, refinement, on_round));
-            summary.error = refined.err();
-            let last = guarded("mapping", || Ok(attending.download(&mut mapper)?));
-            summary.error = summary.error.or(last.err());
+            let refined = self.refine(&mut mapper, &mut summary.keyframes, refinement, &attending, &mut checkpoints, on_round);
+            (summary.step_ms, summary.cloud) = (step_ms(&mapper), attending.cloud());
+            match refined {
+                Ok(refinement) if self.progress.control().keeps_mapper() => {
+                    summary.kept = Some(KeptMapper { mapper, refinement, extra_steps: self.extra_steps() });
+                }
+                Ok(_) => {}
+                Err(error) => summary.error = Some(error),
+            }
+            return summary;
         }
-        summary.cloud = attending.cloud();
-        summary.step_ms = mapper.step_times().iter().map(|t| t.as_secs_f64() * 1e3).collect();
+        (summary.step_ms, summary.cloud) = (step_ms(&mapper), attending.cloud());
         summary
+    }
+
+    /// The final refinement; continues the one that a resumed run had begun.
+    fn refine(
+        &self,
+        mapper: &mut Mapper,
+        records: &mut [KeyframeRecord],
+        begun: Option<FinalRefinement>,
+        attending: &Attending<'_>,
+        checkpoints: &mut Checkpoints,
+        on_round: &mut dyn FnMut(Round<'_>),
+    ) -> Result<FinalRefinement, PipelineError> {
+        let begin = || begun.map_or_else(|| Ok(mapper.begin_refinement()?), Ok);
+        let mut refinement = guarded("mapping", begin)?;
+        let (progress, extra_steps) = (self.progress, self.extra_steps());
+        let refining = Refining { mapper, refinement: &mut refinement, records, attending, progress, extra_steps };
+        refining.refine(checkpoints, on_round)?;
+        Ok(refinement)
+    }
+
+    /// Steps of a round beyond the refinement's end.
+    fn extra_steps(&self) -> usize {
+        self.config.refine.density_every.max(1)
     }
 
     /// A new mapper and an empty map, or those of a checkpoint.
@@ -165,7 +177,7 @@ impl MapThread<'_> {
                 self.frames.into_iter().for_each(wait_for_tracker);
                 self.progress.stopped() || (self.config.yields_to_keyframes && inbox.keyframe_waits())
             };
-            checkpoints.checkpointer.iter_mut().for_each(|c| c.received(&message));
+            checkpoints.received(&message);
             let processed = guarded("mapping", || self.process(mapper, message, &attending.until(&stop)));
             let Processed { report, changed } = processed?;
             tracing::debug!(?report, "message processed");
@@ -212,78 +224,6 @@ impl MapThread<'_> {
             }
         };
         Ok(Processed { report, changed })
-    }
-}
-
-/// The figures of the map after a keyframe or a round.
-fn figures(mapper: &Mapper, keyframes: usize, psnr_db: f32) -> MappingProgress {
-    let times = mapper.step_times();
-    let step_ms = times.last().map_or(0.0, |time| time.as_secs_f64() * 1e3);
-    MappingProgress { keyframes, gaussians: mapper.gaussians(), steps: times.len(), psnr_db, step_ms, refinement: None }
-}
-
-/// The final refinement.
-struct Refining<'a> {
-    thread: &'a MapThread<'a>,
-    attending: &'a Attending<'a>,
-    checkpoints: &'a mut Checkpoints,
-}
-
-impl Refining<'_> {
-    /// Refines one round at a time; continues the refinement that a resumed run had begun. Goes on beyond its end where that is wanted.
-    fn refine(
-        &mut self,
-        mapper: &mut Mapper,
-        summary: &mut MapSummary,
-        begun: Option<FinalRefinement>,
-        on_round: &mut dyn FnMut(Round<'_>),
-    ) -> Result<(), PipelineError> {
-        let progress = self.thread.progress;
-        let mut refinement = begun.map_or_else(|| mapper.begin_refinement(), Ok)?;
-        loop {
-            let stop = || progress.stopped();
-            let Some(report) = mapper.refine(&mut refinement, &self.attending.until(&stop))? else {
-                if progress.stopped() || !progress.control().refines_on() || mapper.gaussians() == 0 {
-                    return Ok(());
-                }
-                refinement.extend(self.thread.config.refine.density_every.max(1));
-                continue;
-            };
-            tracing::debug!(?report, "refined");
-            summary.expose(&mapper.exposures().collect());
-            let figures = figures(mapper, summary.keyframes.len(), report.psnr_db);
-            self.attending.changed();
-            self.attending.publish(MappingProgress { refinement: Some(refinement.steps()), ..figures });
-            progress.control().finished_one();
-            self.attending.attend(mapper)?;
-            let steps = mapper.step_times().len();
-            on_round(Round { mapper, attending: self.attending, steps });
-            if !progress.stopped() {
-                self.checkpoints.finished_one(mapper, Some(&refinement), &summary.keyframes);
-            }
-        }
-    }
-}
-
-/// The run's checkpointer, if any. A checkpoint that fails does not end the run.
-struct Checkpoints {
-    checkpointer: Option<Checkpointer>,
-    failed: bool,
-}
-
-impl Checkpoints {
-    fn finished_one(&mut self, mapper: &Mapper, refinement: Option<&FinalRefinement>, records: &[KeyframeRecord]) {
-        let Some(checkpointer) = &mut self.checkpointer else { return };
-        let began = Instant::now();
-        match guarded("mapping", || Ok(checkpointer.finished_one(mapper, refinement, records)?)) {
-            Ok(None) => {}
-            Ok(Some(bytes)) => tracing::debug!(bytes, ms = began.elapsed().as_secs_f64() * 1e3, "checkpoint written"),
-            Err(error) if !self.failed => {
-                self.failed = true;
-                tracing::warn!("{error}; the run goes on, and the checkpoint before this one stays");
-            }
-            Err(_) => {}
-        }
     }
 }
 
@@ -340,15 +280,6 @@ struct Processed {
     report: Option<KeyframeReport>,
     /// Whether the map changed.
     changed: bool,
-}
-
-impl MapSummary {
-    /// Takes in the exposures of keyframes.
-    fn expose(&mut self, exposures: &BTreeMap<KeyframeId, Exposure>) {
-        for KeyframeRecord { report, .. } in &mut self.keyframes {
-            report.exposure = exposures.get(&report.id).copied().unwrap_or(report.exposure);
-        }
-    }
 }
 
 #[cfg(test)]

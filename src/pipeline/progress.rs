@@ -3,6 +3,7 @@
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use crossbeam::queue::ArrayQueue;
 use image::RgbImage;
@@ -155,6 +156,7 @@ struct Shared {
     poses: Newest<KeyframePoses>,
     images: Newest<FrameImage>,
     orders: Orders,
+    closed: AtomicBool,
     control: Control,
 }
 
@@ -209,9 +211,15 @@ impl Progress {
         self.control().is_stopped()
     }
 
-    /// Orders a view; `false` if too many wait.
+    /// Orders a view; `false` if too many wait, or the mapper has gone.
     pub fn order(&self, order: RenderOrder) -> bool {
-        self.shared.orders.0.push(order).is_ok()
+        !self.shared.closed.load(Ordering::Relaxed) && self.shared.orders.0.push(order).is_ok()
+    }
+
+    /// The mapper goes: no order is taken any more, and those that wait are dropped with their replies.
+    pub fn close_orders(&self) {
+        self.shared.closed.store(true, Ordering::Relaxed);
+        while self.next_order().is_some() {}
     }
 
     /// The oldest order, taken off.

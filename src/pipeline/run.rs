@@ -11,7 +11,7 @@ use super::map_thread::{MapSummary, MapThread};
 use super::progress::guarded;
 use super::read_thread::{ReadSummary, ReadThread};
 use super::track_thread::{TrackSummary, TrackThread};
-use super::{PipelineError, Progress};
+use super::{KeptMapper, PipelineError, Progress};
 use crate::gpu::Gpu;
 use crate::recording::Recording;
 use crate::run_folder::{Checkpointer, Elapsed, History, RunResult};
@@ -29,7 +29,9 @@ pub struct Replay {
     pub result: RunResult,
     /// Error that ended the run early.
     pub error: Option<PipelineError>,
-    /// Whether [`Progress::stop`] ended it early.
+    /// The mapper, where [`Control::keep_mapper`](super::Control::keep_mapper) kept it.
+    pub kept: Option<KeptMapper>,
+    /// Whether [`Control::stop`](super::Control::stop) ended it early.
     pub stopped: bool,
 }
 
@@ -75,6 +77,9 @@ pub fn run(
             .map_err(spawn_error("reading"))?;
         Ok::<_, PipelineError>((join("reading", read), join("tracking", track), join("mapping", map)))
     })?;
+    if !matches!(&map, Ok(MapSummary { kept: Some(_), .. })) {
+        progress.close_orders();
+    }
     if let Ok(MapSummary { behind: true, error, .. }) = map {
         let cause = track.map_or_else(Some, |track| track.error);
         return Err(cause.or(error).expect("a run that falls behind has an error"));
@@ -123,7 +128,7 @@ fn gather(
         wall_s,
         resumed,
     };
-    Replay { result, error: errors.into_iter().next(), stopped: false }
+    Replay { result, kept: map.kept, error: errors.into_iter().next(), stopped: false }
 }
 
 /// A map that every format can hold: Gaussians with a NaN or an infinity are left out, with a warning.

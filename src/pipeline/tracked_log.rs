@@ -7,8 +7,9 @@ use std::time::{Duration, Instant};
 use crossbeam::channel::{bounded, unbounded};
 
 use super::known_poses::{self, Scene};
-use super::map_thread::{MapSummary, MapThread, Round};
+use super::map_thread::{MapSummary, MapThread};
 use super::read_thread::ReadThread;
+use super::refining::Round;
 use super::run::FRAMES_AHEAD;
 use super::track_thread::TrackThread;
 use super::{PipelineError, Progress};

@@ -119,7 +119,13 @@ impl Viewer<'_> {
     /// Answers from a thread that may block. Beyond the answers under way, requests are dropped: newest wins at the page.
     fn reply(&self, what: &'static str, work: impl FnOnce() -> Result<Outgoing, String> + Send + 'static) {
         let Ok(place) = self.answers.clone().try_reserve_owned() else { return };
+        let Ok(permit) = self.service.answers.clone().try_acquire_owned() else {
+            let why = "too many viewers ask at once; ask again";
+            place.send(Outgoing::text(&ToViewer::Refused { what, why }));
+            return;
+        };
         tokio::task::spawn_blocking(move || {
+            let _permit = permit;
             let answer = work().unwrap_or_else(|why| Outgoing::text(&ToViewer::Refused { what, why: &why }));
             place.send(answer);
         });

@@ -70,6 +70,11 @@ impl Live {
         self.desk.clone()
     }
 
+    /// The refinement goes on after the run's end.
+    pub fn refining(&self) {
+        self.desk.phase.store(1, Ordering::Relaxed);
+    }
+
     /// The map is finished and is being measured.
     pub fn measuring(&self) {
         self.desk.phase.store(2, Ordering::Relaxed);

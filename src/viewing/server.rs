@@ -37,6 +37,8 @@ const HEADER_TIME: Duration = Duration::from_secs(5);
 const ANSWER_TIME: Duration = Duration::from_secs(60);
 /// Threads that load images and wait for renders.
 const BLOCKING_THREADS: usize = 2;
+/// Answers under way for all viewers together.
+const MOST_ANSWERS: usize = 8;
 const TOKEN_BYTES: usize = 16;
 
 /// What answers the questions of viewers. The calls may block.
@@ -98,6 +100,8 @@ pub(super) struct Service {
     token: String,
     page: String,
     viewers: AtomicUsize,
+    /// For answers under way, of all viewers.
+    pub answers: Arc<Semaphore>,
 }
 
 /// Whether a connection comes from this machine.
@@ -122,6 +126,7 @@ impl Server {
             desk,
             remote_control: options.remote_control,
             viewers: AtomicUsize::new(0),
+            answers: Arc::new(Semaphore::new(MOST_ANSWERS)),
         };
         let runtime = tokio::runtime::Builder::new_current_thread()
             .enable_all()

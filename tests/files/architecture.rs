@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 const EVERYTHING_ABOVE: &[&str] = &["*"];
 
 /// A module, and the modules whose items it may name. `verification` is in no list but the command line's: production does not use the oracle.
-const ALLOWED: [(&str, &[&str]); 24] = [
+const ALLOWED: [(&str, &[&str]); 25] = [
     ("files", &[]),
     ("geometry", &[]),
     ("sequence", &["geometry"]),
@@ -23,6 +23,7 @@ const ALLOWED: [(&str, &[&str]); 24] = [
     ("calibration", &["geometry", "sequence", "splat", "gpu", "render", "optimise", "mapping"]),
     ("export", &["files", "geometry", "splat"]),
     ("evaluation", &["files", "geometry", "sequence", "splat", "gpu", "render"]),
+    ("film", &["files", "geometry"]),
     ("inspection", &["geometry", "sequence", "tracking", "evaluation"]),
     ("config", &["sequence", "tracking", "mapping", "export"]),
     ("recording", &["geometry", "sequence", "evaluation", "config"]),

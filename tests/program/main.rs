@@ -7,6 +7,7 @@ mod bad_input;
 mod check;
 mod end_to_end;
 mod faults;
+mod film;
 mod interaction;
 mod known_poses;
 mod quality;

@@ -114,7 +114,10 @@ export class Actions {
   clicked(x, y, touch) {
     const { ratio } = this.stage.measure();
     const reach = (touch ? PICK_PIXELS_TOUCH : PICK_PIXELS) * ratio;
-    const id = this.stage.layers.keyframes ? this.scene.pick(this.stage.view(), x * ratio, y * ratio, this.scene.frustumSize(this.store), reach) : null;
+    if (!this.stage.layers.keyframes) {
+      return;
+    }
+    const id = this.scene.pick(this.stage.view(), x * ratio, y * ratio, this.scene.frustumSize(this.store), reach);
     if (id !== null) {
       this.openKeyframe(id, false);
     }
@@ -179,7 +182,8 @@ export class Actions {
   askRender(kind, pose, camera, id) {
     this.requests += 1;
     const { width, height, fx, fy, cx, cy } = camera;
-    this.send({ type: "render", request: this.requests, kind, p: pose.p, q: pose.q, width, height, fx, fy, cx, cy, ...(id === undefined ? {} : { id }) });
+    const view = { p: pose.p, q: pose.q, width, height, fx, fy, cx, cy };
+    this.send({ type: "render", request: this.requests, kind, ...view, ...(id === undefined ? {} : { id }) });
     return this.requests;
   }
 
@@ -228,7 +232,9 @@ export class Actions {
     if (this.fatal || event.ctrlKey || event.metaKey || event.altKey || event.defaultPrevented || this.root.querySelector("dialog[open]")) {
       return;
     }
-    if ((typing && event.key.startsWith("Arrow")) || ((event.key === " " || event.key === "Enter") && event.target !== this.overlay.canvas && event.target !== document.body)) {
+    // Space and enter press a button that has the focus.
+    const pressing = (event.key === " " || event.key === "Enter") && event.target !== this.overlay.canvas && event.target !== document.body;
+    if (pressing || (typing && event.key.startsWith("Arrow"))) {
       return;
     }
     if (this.answer(event) || this.controls.keyDown(event)) {

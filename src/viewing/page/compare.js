@@ -20,7 +20,8 @@ export class Compare {
     this.title = element("b", {});
     this.figure = element("span", { class: "figure" });
     this.hint = element("p", { class: "hint", hidden: true });
-    this.slider = element("input", { type: "range", min: 0, max: 100, value: 50, "aria-label": "Share that shows the recorded picture", oninput: () => this.slide() });
+    const label = "Share that shows the recorded picture";
+    this.slider = element("input", { type: "range", min: 0, max: 100, value: 50, "aria-label": label, oninput: () => this.slide() });
     this.toggle = element("input", { type: "checkbox", onchange: () => this.showDifference(this.toggle.checked) });
     this.exactButton = iconButton("exact", "Error by the mapper's own rasterizer", () => this.askExact(), "Exact error");
     this.pair = element("div", { class: "pair" }, this.rendered, this.recorded, this.difference, this.exact, this.hint);
@@ -50,7 +51,7 @@ export class Compare {
     }
     this.id = id;
     this.camera = null;
-    this.hasRecorded = false;
+    this.setRecorded(false);
     this.hideExact();
     this.section.hidden = false;
     this.exactButton.hidden = !(this.scene.hello && this.scene.hello.exact);
@@ -58,7 +59,6 @@ export class Compare {
     this.caption = keyframe.frame === undefined ? "" : `frame ${keyframe.frame}`;
     setText(this.figure, this.caption);
     const known = this.pictures.get(id);
-    this.recorded.hidden = true;
     this.difference.hidden = true;
     const asked = !known && this.hooks.ask(id);
     this.say(known ? "" : asked ? "The recorded picture is on its way." : "The recorded picture is not at hand.");
@@ -97,11 +97,18 @@ export class Compare {
     await showBlob(this.recorded, image.blob);
     if (image.id === this.id) {
       this.camera = image.camera || null;
-      this.hasRecorded = true;
-      this.recorded.hidden = false;
+      this.setRecorded(true);
       this.say("");
       this.slide();
     }
+  }
+
+  // Without a recorded picture there is nothing to slide or to subtract.
+  setRecorded(on) {
+    this.hasRecorded = on;
+    this.recorded.hidden = !on;
+    this.toggle.disabled = !on;
+    this.slider.disabled = !on || this.toggle.checked;
   }
 
   refused(why) {
@@ -116,7 +123,7 @@ export class Compare {
 
   showDifference(on) {
     this.toggle.checked = on;
-    this.slider.disabled = on;
+    this.slider.disabled = on || !this.hasRecorded;
     this.hideExact();
     this.difference.hidden = !on || !this.hasRecorded;
   }
@@ -153,7 +160,7 @@ export class Compare {
     }
   }
 
-  // Difference and likeness of the two pictures.
+  // Difference and PSNR of the two pictures.
   measure(picture) {
     const { width, height, rgba } = picture;
     const recorded = this.recorded.getContext("2d").getImageData(0, 0, width, height).data;

@@ -12,7 +12,8 @@ const HELP_ROWS = [
 export function helpDialog(parent) {
   const rows = HELP_ROWS.map(([keys, effect]) => element("div", {}, element("dt", {}, keys), element("dd", {}, effect)));
   const dialog = element("dialog", { class: "help", "aria-label": "Keys" });
-  dialog.append(element("header", {}, element("h3", {}, "Keys and gestures"), iconButton("close", "Close", () => dialog.close())), element("dl", {}, ...rows));
+  const close = iconButton("close", "Close", () => dialog.close());
+  dialog.append(element("header", {}, element("h3", {}, "Keys and gestures"), close), element("dl", {}, ...rows));
   dialog.addEventListener("click", event => event.target === dialog && dialog.close());
   parent.append(dialog);
   return dialog;

@@ -2,7 +2,7 @@
 
 import { fittedCamera } from "./math.js";
 import { lengthText } from "./dom.js";
-import { readMessage, MessageError, bytesOfBase64 } from "./messages.js";
+import { readMessage, MessageError, ProtocolError, bytesOfBase64 } from "./messages.js";
 import { Connection, Inbox } from "./connection.js";
 import { MapStore } from "./map_store.js";
 import { Scene } from "./scene.js";
@@ -18,10 +18,17 @@ import { Actions } from "./actions.js";
 // Growth of the scene after which an untouched view is fitted again.
 const REFIT_GROWTH = 1.25;
 
+// A type that is not here is ignored.
+const TAKERS = new Map([
+  ["hello", "takeHello"], ["poses", "takePoses"], ["path", "takePath"], ["statistics", "takeStatistics"],
+  ["map", "takeMap"], ["image", "takeImage"], ["refused", "takeRefused"],
+]);
+
 class Viewer extends Actions {
   constructor(root) {
     super();
-    Object.assign(this, { root, updates: 0, revision: null, requests: 0, connected: false, following: false, untouched: true, file: false, fatal: false, state: "starting" });
+    Object.assign(this, { root, updates: 0, revision: null, requests: 0, state: "starting" });
+    Object.assign(this, { connected: false, following: false, untouched: true, file: false, fatal: false });
     root.classList.add("viewer");
     root.replaceChildren();
     this.scene = new Scene();
@@ -78,6 +85,7 @@ class Viewer extends Actions {
   // Plays the messages of a file, or connects.
   start() {
     if (this.fatal) {
+      this.overlay.empty.hidden = true;
       return;
     }
     const held = [...document.querySelectorAll("script.message")];
@@ -86,6 +94,7 @@ class Viewer extends Actions {
       return;
     }
     if (!location.host) {
+      this.overlay.empty.hidden = true;
       this.panel.setStatus("bad", "nothing to show");
       this.overlay.banner("connection", "This file holds no messages, and has no keysplat behind it.");
       return;
@@ -112,8 +121,10 @@ class Viewer extends Actions {
       this.overlay.banner("connection", null);
     } else if (state.kind === "waiting") {
       this.inbox.clear();
-      const why = state.why ? `keysplat closed the connection: ${state.why}.` : state.failures > 1 ? "keysplat does not answer." : "The connection to keysplat is lost.";
-      this.overlay.banner("connection", `${why} Next try in ${state.seconds < 1 ? "a moment" : Math.round(state.seconds) + " s"}; what is shown stays.`, () => this.connection.hurry());
+      const silence = state.failures > 1 ? "keysplat does not answer." : "The connection to keysplat is lost.";
+      const why = state.why ? `keysplat closed the connection: ${state.why}.` : silence;
+      const pause = state.seconds < 1 ? "a moment" : `${Math.round(state.seconds)} s`;
+      this.overlay.banner("connection", `${why} Next try in ${pause}; what is shown stays.`, () => this.connection.hurry());
     }
     this.state = { connecting: "connecting", connected: "connected", waiting: "reconnecting" }[state.kind];
     this.showStatus();
@@ -136,12 +147,12 @@ class Viewer extends Actions {
   async take(given) {
     try {
       const message = readMessage(typeof given === "function" ? given() : given);
-      const taker = { hello: "takeHello", poses: "takePoses", path: "takePath", statistics: "takeStatistics", map: "takeMap", image: "takeImage", refused: "takeRefused" }[message.type];
+      const taker = TAKERS.get(message.type);
       if (taker) {
         await this[taker](message);
       }
     } catch (error) {
-      if (error instanceof MessageError && error.message.includes("protocol")) {
+      if (error instanceof ProtocolError) {
         this.overlay.banner("connection", error.message);
         this.state = "another protocol";
         this.connected = false;
@@ -198,6 +209,7 @@ class Viewer extends Actions {
     this.updates += 1;
     await this.stage.reach();
     this.revision = map.revision;
+    this.overlay.setProgress(this.store.gaussians, map.gaussians, map.complete !== false);
     this.send({ type: "taken", revision: map.revision });
     this.sceneChanged();
     this.current.changed();
@@ -234,6 +246,7 @@ class Viewer extends Actions {
     this.controls.up = up;
     this.controls.radius = radius;
     const known = this.scene.keyframes.size > 0 || this.store.gaussians > 0;
+    this.overlay.empty.hidden = known;
     const last = this.untouchedRadius;
     if (this.untouched && known && !this.following && (!last || radius > last * REFIT_GROWTH || radius < last / REFIT_GROWTH)) {
       this.untouchedRadius = radius;

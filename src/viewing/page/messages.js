@@ -2,6 +2,9 @@
 
 export class MessageError extends Error {}
 
+// The other end speaks another version: nothing that it says can be read.
+export class ProtocolError extends MessageError {}
+
 export const PROTOCOL = 1;
 const BASE_WORDS = 8;
 
@@ -31,7 +34,9 @@ export function isCamera(value) {
 
 const TEXT_CHECKS = {
   hello(m) {
-    demand(m.protocol === PROTOCOL, `This page reads protocol ${PROTOCOL}; keysplat sent protocol ${m.protocol}. Load the page anew from the same keysplat.`);
+    if (m.protocol !== PROTOCOL) {
+      throw new ProtocolError(`This page reads protocol ${PROTOCOL}; keysplat sent protocol ${m.protocol}. Load the page anew from keysplat.`);
+    }
     demand(m.camera === null || m.camera === undefined || isCamera(m.camera), "The camera of a hello has no intrinsics.");
   },
   poses(m) {
@@ -44,7 +49,8 @@ const TEXT_CHECKS = {
     demand(!m.truth || (Array.isArray(m.truth) && m.truth.every(p => isVector(p, 3))), "A position of the true path is not a list of numbers.");
   },
   statistics(m) {
-    demand(Array.isArray(m.entries) && m.entries.every(e => e !== null && typeof e === "object" && Number.isFinite(e.s)), "An entry of the statistics has no time.");
+    const isEntry = e => e !== null && typeof e === "object" && Number.isFinite(e.s);
+    demand(Array.isArray(m.entries) && m.entries.every(isEntry), "An entry of the statistics has no time.");
   },
   refused(m) {
     demand(typeof m.why === "string", "A refusal gives no reason.");

@@ -1,6 +1,6 @@
 // What lies over the picture: colourings and their legend, tools, banners and notes.
 
-import { element, iconButton, setText, lengthText } from "./dom.js";
+import { element, iconButton, setText, countText, lengthText } from "./dom.js";
 import { RAMP } from "./shaders.js";
 
 const COLORINGS = [["color", "Colour"], ["depth", "Depth"], ["seen", "Seen by"], ["error", "Error"]];
@@ -10,25 +10,32 @@ export class Overlay {
   constructor(root, viewer) {
     this.root = root;
     this.coloring = "color";
-    this.canvas = element("canvas", { class: "scene", tabIndex: 0, role: "application", "aria-label": "The map. Drag to orbit; the question mark lists the keys." });
+    const label = "The map. Drag to orbit; the question mark lists the keys.";
+    this.canvas = element("canvas", { class: "scene", tabIndex: 0, role: "application", "aria-label": label });
     this.banners = element("div", { class: "banners", role: "alert" });
     this.noteText = element("p", { class: "chip note", role: "status", hidden: true });
+    this.empty = element("p", { class: "empty" }, "Waiting for the first keyframe");
     this.buildColorings(viewer);
     this.buildTools(viewer);
-    this.stage = element("div", { class: "stage" }, this.canvas, this.top, this.tools, this.noteText, this.banners);
+    this.stage = element("div", { class: "stage" }, this.canvas, this.empty, this.top, this.tools, this.noteText, this.banners);
     root.append(this.stage);
     this.shown = new Map();
   }
 
   buildColorings(viewer) {
     this.radios = COLORINGS.map(([name, label]) => {
-      const radio = element("input", { type: "radio", name: "viewer-coloring", value: name, checked: name === "color", onchange: () => viewer.setColoring(name) });
+      const change = () => viewer.setColoring(name);
+      const radio = element("input", { type: "radio", name: "viewer-coloring", value: name, checked: name === "color", onchange: change });
       return element("label", {}, radio, element("span", {}, label));
     });
     this.low = element("span", {});
     this.high = element("span", {});
-    this.legend = element("div", { class: "scale chip", hidden: true }, this.low, element("i", { class: "bar", style: `background: linear-gradient(90deg, ${RAMP.map(c => `rgb(${c.join(" ")})`).join(", ")})` }), this.high);
-    this.top = element("div", { class: "top" }, element("div", { class: "choices", role: "radiogroup", "aria-label": "Colouring" }, ...this.radios), this.legend);
+    const stops = RAMP.map(c => `rgb(${c.join(" ")})`).join(", ");
+    const bar = element("i", { class: "bar", style: `background: linear-gradient(90deg, ${stops})` });
+    this.legend = element("div", { class: "scale chip", hidden: true }, this.low, bar, this.high);
+    this.progress = element("p", { class: "chip", hidden: true });
+    const choices = element("div", { class: "choices", role: "radiogroup", "aria-label": "Colouring" }, ...this.radios);
+    this.top = element("div", { class: "top" }, choices, this.legend, this.progress);
   }
 
   buildTools(viewer) {
@@ -69,6 +76,12 @@ export class Overlay {
     for (const label of this.radios) {
       label.firstChild.checked = label.firstChild.value === name;
     }
+  }
+
+  // How much of a map has come, while it is not whole.
+  setProgress(held, whole, complete) {
+    this.progress.hidden = complete || !(whole > 0);
+    setText(this.progress, `${countText(held)} of ${countText(whole)} Gaussians`);
   }
 
   // Numbers at the ends of the legend.

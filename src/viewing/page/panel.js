@@ -10,12 +10,12 @@ const FIGURES = [
   ["Frames", (s, hello) => hello && hello.frames ? `${countText(s.frames)} / ${countText(hello.frames)}` : countText(s.frames)],
   ["Keyframes", s => countText(s.keyframes)],
   ["Gaussians", s => countText(s.gaussians)],
-  ["Likeness", s => fixedText(s.psnr_db, 2, " dB")],
-  ["A frame", s => fixedText(s.frame_ms, 0, " ms")],
-  ["A step", s => fixedText(s.step_ms, 0, " ms")],
+  ["PSNR", s => fixedText(s.psnr_db, 2, " dB")],
+  ["Time a frame", s => fixedText(s.frame_ms, 0, " ms")],
+  ["Time a step", s => fixedText(s.step_ms, 0, " ms")],
   ["Steps", s => countText(s.steps)],
   ["Memory", s => bytesText(s.host_bytes)],
-  ["Time so far", s => durationText(s.s)],
+  ["Elapsed", s => durationText(s.s)],
   ["Time left", s => durationText(s.left_s)],
 ];
 
@@ -32,6 +32,8 @@ export class Panel {
   // `hooks`: `control(what)`, `finish()`, `layer(name, on)`, `background(name)`, `keyframe(step)`, `pictures(open)`.
   constructor(parent, hooks) {
     this.hooks = hooks;
+    // A report has these plots larger.
+    const embedded = parent.classList.contains("embedded");
     this.title = element("h2", {}, "keysplat");
     this.dot = element("i", { class: "dot" });
     this.status = element("span", {}, "starting");
@@ -43,7 +45,11 @@ export class Panel {
     this.pictures = this.section("Newest frame", open => hooks.pictures(open));
     this.buildLayers();
     this.buildKeyframes();
-    this.plots = new Plots(this.section("Over time"));
+    const plots = this.section("Over time");
+    plots.details.open = !embedded;
+    this.plots = new Plots(plots);
+    this.figured = [this.figureBox, plots.details];
+    this.showFigures(false);
   }
 
   section(title, toggled) {
@@ -70,7 +76,8 @@ export class Panel {
 
   buildFigures() {
     this.figures = FIGURES.map(([name]) => ({ name, value: element("b", {}, "–") }));
-    this.figureBox = element("dl", { class: "figures" }, ...this.figures.map(({ name, value }) => element("div", {}, element("dt", {}, name), element("dd", {}, value))));
+    const boxes = this.figures.map(({ name, value }) => element("div", {}, element("dt", {}, name), element("dd", {}, value)));
+    this.figureBox = element("dl", { class: "figures" }, ...boxes);
     this.root.append(this.figureBox);
   }
 
@@ -84,7 +91,9 @@ export class Panel {
     });
     const black = checkbox("Black background", true, on => this.hooks.background(on ? "black" : "panel"), "#000");
     body.append(element("div", { class: "checks" }, ...boxes, black));
-    this.errorLegend = element("div", { class: "scale", hidden: true }, element("span", {}, "0"), element("i", { class: "bar errors" }), element("span", {}), element("em", {}, "error of the path"));
+    this.largestError = element("span", {});
+    this.errorLegend = element("div", { class: "scale", hidden: true }, element("span", {}, "0"), element("i", { class: "bar errors" }),
+      this.largestError, element("em", {}, "error of the path"));
     body.append(this.errorLegend);
   }
 
@@ -92,7 +101,8 @@ export class Panel {
     const body = this.section("Keyframes");
     this.keyframeText = element("span", { class: "grow" }, "none yet");
     body.append(element("div", { class: "row" },
-      iconButton("previous", "Previous keyframe ([)", () => this.hooks.keyframe(-1)), iconButton("next", "Next keyframe (])", () => this.hooks.keyframe(1)), this.keyframeText));
+      iconButton("previous", "Previous keyframe ([)", () => this.hooks.keyframe(-1)),
+      iconButton("next", "Next keyframe (])", () => this.hooks.keyframe(1)), this.keyframeText));
   }
 
   setStatus(kind, text) {
@@ -108,12 +118,21 @@ export class Panel {
     this.pictures.details.hidden = !hello.live;
     this.plots.clear();
     this.latest = null;
+    this.showFigures(hello.live);
+  }
+
+  // Figures and plots have no place where none will come.
+  showFigures(on) {
+    this.figured.forEach(node => {
+      node.hidden = !on;
+    });
   }
 
   takeStatistics(entries) {
     if (entries.length === 0) {
       return;
     }
+    this.showFigures(true);
     this.plots.add(entries);
     this.latest = entries[entries.length - 1];
     this.figures.forEach(({ value }, i) => setText(value, FIGURES[i][1](this.latest, this.hello)));
@@ -140,11 +159,12 @@ export class Panel {
   }
 
   setKeyframes(count, chosen) {
-    setText(this.keyframeText, count === 0 ? "none yet" : chosen === null ? `${countText(count)}; click one to compare` : `Keyframe ${chosen} of ${countText(count)}`);
+    const known = chosen === null ? `${countText(count)}; click one to compare` : `Keyframe ${chosen}, ${countText(count)} in all`;
+    setText(this.keyframeText, count === 0 ? "none yet" : known);
   }
 
   setError(text) {
     this.errorLegend.hidden = text === null;
-    setText(this.errorLegend.children[2], text || "");
+    setText(this.largestError, text || "");
   }
 }

@@ -22,13 +22,13 @@ export async function showBlob(canvas, blob) {
   bitmap.close();
 }
 
-// Calls `act` at most once in a while, and once more after the last call.
+// Calls `act` at most once in a while, and once more after the last call. An act that takes long comes the more seldom.
 export class Throttle {
   constructor(act, ms) {
     this.act = act;
     this.ms = ms;
     this.timer = 0;
-    this.last = -Infinity;
+    this.next = 0;
     this.running = false;
     this.again = false;
   }
@@ -37,18 +37,20 @@ export class Throttle {
     if (this.running) {
       this.again = true;
     } else if (!this.timer) {
-      this.timer = setTimeout(() => this.run(), Math.max(0, this.last + this.ms - performance.now()));
+      this.timer = setTimeout(() => this.run(), Math.max(0, this.next - performance.now()));
     }
   }
 
   async run() {
     this.timer = 0;
     this.running = true;
+    const began = performance.now();
     try {
       await this.act();
     } finally {
       this.running = false;
-      this.last = performance.now();
+      const now = performance.now();
+      this.next = now + Math.max(this.ms, 2 * (now - began));
     }
     if (this.again) {
       this.again = false;

@@ -7,9 +7,9 @@ const MOST_ENTRIES = 2000;
 const REDRAW_MS = 250;
 
 const PLOTS = [
-  { title: "Likeness of views", lines: [{ field: "psnr_db", tone: "--accent", text: v => fixedText(v, 1, " dB") }] },
+  { title: "PSNR of the views", lines: [{ field: "psnr_db", tone: "--accent", text: v => fixedText(v, 1, " dB") }] },
   { title: "Gaussians", zero: true, lines: [{ field: "gaussians", tone: "--accent", text: countText }] },
-  { title: "Time a frame, a step", zero: true, lines: [
+  { title: "Time a frame and a step", zero: true, lines: [
     { field: "frame_ms", tone: "--accent", text: v => fixedText(v, 0, " ms") },
     { field: "step_ms", tone: "--second", text: v => fixedText(v, 0, " ms") }] },
   { title: "Memory", zero: true, lines: [{ field: "host_bytes", tone: "--accent", text: bytesText }] },

@@ -88,13 +88,24 @@ export class Scene {
       middle = add3(middle, scale3(pose.p, 1 / poses.length));
     }
     const spread = quantile(poses.map(pose => length3(sub3(pose.p, middle))), 0.9) || 0;
-    const steps = this.ids().slice(1).map((id, i) => length3(sub3(this.keyframes.get(id).p, this.keyframes.get(this.ids()[i]).p)));
-    this.measured = { up: unit3(up, [0, -1, 0]), ahead: unit3(ahead, [0, 0, 1]), middle, spread, step: steps.length > 0 ? quantile(steps, 0.5) : 0, poses };
+    const ids = this.ids();
+    const steps = ids.slice(1).map((id, i) => length3(sub3(this.keyframes.get(id).p, this.keyframes.get(ids[i]).p)));
+    const step = quantile(steps, 0.5) || 0;
+    this.measured = { up: unit3(up, [0, -1, 0]), ahead: unit3(ahead, [0, 0, 1]), middle, spread, step, poses };
     return this.measured;
   }
 
   // Middle and radius of the map and the cameras together.
   extent(store) {
+    const key = `${this.revision} ${store.version}`;
+    if (this.extentKey !== key) {
+      this.extentKey = key;
+      this.extentKnown = this.findExtent(store);
+    }
+    return this.extentKnown;
+  }
+
+  findExtent(store) {
     const { middle, spread, ahead } = this.measure();
     let sum = [0, 0, 0];
     let total = 0;

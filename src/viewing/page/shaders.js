@@ -144,9 +144,13 @@ void main() {
 
 export const PROJECT_FRAGMENT = SHADER_HEAD + PROJECT_HEAD + PROJECT_HARMONICS + PROJECT_MAIN;
 
+// Quads of one instance: adapters take long for instances of one quad only.
+export const BATCH_QUADS = 256;
+
 // A parallelogram around the ellipse on which alpha falls to 1/255.
 export const SPLAT_VERTEX = SHADER_HEAD + `
-layout(location = 0) in uint slot;
+uniform usampler2D order;
+uniform int count;
 uniform usampler2D shapes;
 uniform usampler2D paints;
 uniform vec2 size;
@@ -155,18 +159,20 @@ flat out vec4 at_cut_opacity;
 flat out vec3 color;
 
 void main() {
+  gl_Position = vec4(2.0, 2.0, 0.0, 1.0);
+  int number = gl_InstanceID * ${BATCH_QUADS} + (gl_VertexID >> 2);
+  uint slot = texelFetch(order, ivec2(number & 1023, number >> 10), 0).x;
   ivec2 place = ivec2(slot & 1023u, slot >> 10u);
   uvec4 shape = texelFetch(shapes, place, 0);
   uvec4 paint = texelFetch(paints, place, 0);
-  gl_Position = vec4(2.0, 2.0, 0.0, 1.0);
   factor = vec3(uintBitsToFloat(shape.zw), uintBitsToFloat(paint.x));
   color = vec3(unpackHalf2x16(paint.y), unpackHalf2x16(paint.z).x);
   float opacity = float(paint.z >> 16u) / 65535.0;
   vec2 mean = uintBitsToFloat(shape.xy);
   float cut = log(max(opacity * 255.0, 1e-9));
   at_cut_opacity = vec4(mean, cut, opacity);
-  if (paint.w == 1u) {
-    vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0 - 1.0;
+  if (paint.w == 1u && number < count) {
+    vec2 corner = vec2(gl_VertexID & 1, (gl_VertexID >> 1) & 1) * 2.0 - 1.0;
     vec2 u = corner * (sqrt(max(cut, 0.0)) * 1.002 + 1e-4);
     float dy = u.y / factor.z;
     float dx = (u.x - factor.y * dy) / factor.x;

@@ -4,7 +4,10 @@
 
 // Row `row` has slots from row · 256 on. `posed` holds centre and radius of each: how far alpha reaches 1/255, before dilation.
 function workerState() {
-  return { rows: 0, counts: new Uint16Array(0), posed: new Float32Array(0), depths: new Float32Array(0), slots: new Uint32Array(0), keys: new Uint16Array(0), bins: new Uint32Array(65537), seen: null };
+  return {
+    rows: 0, counts: new Uint16Array(0), posed: new Float32Array(0), depths: new Float32Array(0), slots: new Uint32Array(0),
+    keys: new Uint16Array(0), bins: new Uint32Array(65537), seen: null,
+  };
 }
 
 function workerGrow(state, row) {
@@ -102,12 +105,16 @@ function workerSort(state, message) {
   for (let key = 1; key < 65536; key++) {
     bins[key] += bins[key - 1];
   }
-  const order = message.buffer && message.buffer.byteLength >= 4 * found ? new Uint32Array(message.buffer) : new Uint32Array(Math.ceil(found * 1.3) + 1024);
+  // The page uploads whole lines of 1,024.
+  const least = Math.ceil(found / 1024) * 1024;
+  const order = message.buffer && message.buffer.byteLength >= 4 * least ? new Uint32Array(message.buffer) : new Uint32Array(Math.ceil(least * 1.25));
   for (let n = 0; n < found; n++) {
     const place = bins[keys[n]]++;
     order[message.reversed ? found - 1 - place : place] = slots[n];
   }
-  self.postMessage({ type: "order", job: message.job, version: message.version, order, count: found, near: range[0], far: range[1], ms: performance.now() - began }, [order.buffer]);
+  const { job, version } = message;
+  const ms = performance.now() - began;
+  self.postMessage({ type: "order", job, version, order, count: found, near: range[0], far: range[1], ms }, [order.buffer]);
 }
 
 // Depth that so many Gaussians do not exceed.

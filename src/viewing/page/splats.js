@@ -1,11 +1,12 @@
 // Draws Gaussians with WebGL2: textures of the map, projection, blending into a target, and the way from there to canvas or memory.
 
-import { SCREEN_VERTEX, PROJECT_FRAGMENT, SPLAT_VERTEX, SPLAT_FRAGMENT, RESOLVE_FRAGMENT } from "./shaders.js";
+import { SCREEN_VERTEX, PROJECT_FRAGMENT, SPLAT_VERTEX, SPLAT_FRAGMENT, RESOLVE_FRAGMENT, BATCH_QUADS } from "./shaders.js";
 import { TEXTURE_SLOTS } from "./map_store.js";
 
 export const SHOWN_COLOR = 0;
 export const SHOWN_DEPTH = 1;
 export const SHOWN_SEEN = 2;
+const FENCE_POLL_MS = 4;
 
 export function openGl(canvas) {
   return canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, stencil: false, powerPreference: "high-performance" });
@@ -60,6 +61,7 @@ export class SplatRenderer {
     this.lines = -1;
     this.degree = -1;
     this.emptyArray = gl.createVertexArray();
+    this.batch = this.makeBatch();
     gl.disable(gl.DEPTH_TEST);
     gl.disable(gl.DITHER);
   }
@@ -140,29 +142,38 @@ export class SplatRenderer {
     }
   }
 
-  // Holds an order of slots under a name.
+  // Holds an order of slots under a name, in a texture as wide as the others.
   setOrder(name, slots, count) {
     const gl = this.gl;
-    if (!this.orders[name]) {
-      const buffer = gl.createBuffer();
-      const array = gl.createVertexArray();
-      gl.bindVertexArray(array);
-      gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
-      gl.enableVertexAttribArray(0);
-      gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 4, 0);
-      gl.vertexAttribDivisor(0, 1);
-      this.orders[name] = { buffer, array, count: 0, room: 0 };
+    const lines = Math.ceil(count / TEXTURE_SLOTS);
+    let order = this.orders[name];
+    if (!order || order.lines < lines) {
+      gl.deleteTexture(order ? order.texture : null);
+      const room = Math.ceil(lines * 1.25) + 1;
+      order = { texture: this.texture(gl.R32UI, TEXTURE_SLOTS, room), lines: room, count: 0 };
+      this.orders[name] = order;
     }
-    const order = this.orders[name];
-    gl.bindBuffer(gl.ARRAY_BUFFER, order.buffer);
-    if (count > order.room) {
-      order.room = Math.ceil(count * 1.25);
-      gl.bufferData(gl.ARRAY_BUFFER, 4 * order.room, gl.DYNAMIC_DRAW);
-    }
-    if (count > 0) {
-      gl.bufferSubData(gl.ARRAY_BUFFER, 0, slots, 0, count);
+    gl.bindTexture(gl.TEXTURE_2D, order.texture);
+    if (lines > 0) {
+      // Whole lines: the worker's arrays have room for them.
+      gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, TEXTURE_SLOTS, lines, gl.RED_INTEGER, gl.UNSIGNED_INT, slots);
     }
     order.count = count;
+  }
+
+  // Corners of a batch of quads as two triangles each.
+  makeBatch() {
+    const gl = this.gl;
+    const indices = new Uint16Array(6 * BATCH_QUADS);
+    for (let quad = 0; quad < BATCH_QUADS; quad++) {
+      indices.set([0, 1, 2, 2, 1, 3].map(corner => 4 * quad + corner), 6 * quad);
+    }
+    const array = gl.createVertexArray();
+    gl.bindVertexArray(array);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, indices, gl.STATIC_DRAW);
+    gl.bindVertexArray(null);
+    return array;
   }
 
   target(name, width, height) {
@@ -202,11 +213,13 @@ export class SplatRenderer {
     gl.uniform2f(places.size, width, height);
     this.bind(0, this.shapes, places.shapes);
     this.bind(1, this.paints, places.paints);
+    this.bind(2, order.texture, places.order);
+    gl.uniform1i(places.count, order.count);
     gl.enable(gl.BLEND);
     // The target's alpha is the transmittance: half floats keep its small values, where 1 - α would drown.
     gl.blendFuncSeparate(this.floats ? gl.DST_ALPHA : gl.ONE, this.floats ? gl.ONE : gl.ONE_MINUS_SRC_ALPHA, gl.ZERO, gl.ONE_MINUS_SRC_ALPHA);
-    gl.bindVertexArray(order.array);
-    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, order.count);
+    gl.bindVertexArray(this.batch);
+    gl.drawElementsInstanced(gl.TRIANGLES, 6 * BATCH_QUADS, gl.UNSIGNED_SHORT, 0, Math.ceil(order.count / BATCH_QUADS));
     gl.disable(gl.BLEND);
   }
 
@@ -254,15 +267,41 @@ export class SplatRenderer {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  // The target's colours as bytes, rows from the top.
-  readBytes(name, width, height, ramped = false) {
+  // The target's colours as bytes, rows from the top; null where the context is lost meanwhile. The page goes on while the adapter draws.
+  async readBytes(name, width, height) {
     const gl = this.gl;
     const bytes = this.target("bytes", width, height);
-    this.resolve(name, bytes, width, height, [0, 0, 0], ramped);
+    this.resolve(name, bytes, width, height, [0, 0, 0], false);
     const rgba = new Uint8Array(4 * width * height);
-    gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, rgba);
+    const buffer = gl.createBuffer();
+    gl.bindBuffer(gl.PIXEL_PACK_BUFFER, buffer);
+    gl.bufferData(gl.PIXEL_PACK_BUFFER, rgba.length, gl.STREAM_READ);
+    gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, 0);
+    gl.bindBuffer(gl.PIXEL_PACK_BUFFER, null);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-    return rgba;
+    const done = await this.signalled();
+    if (done) {
+      gl.bindBuffer(gl.PIXEL_PACK_BUFFER, buffer);
+      gl.getBufferSubData(gl.PIXEL_PACK_BUFFER, 0, rgba);
+      gl.bindBuffer(gl.PIXEL_PACK_BUFFER, null);
+    }
+    gl.deleteBuffer(buffer);
+    return done ? rgba : null;
+  }
+
+  // Whether the adapter has done all that was asked up to now; false where its context is lost first.
+  async signalled() {
+    const gl = this.gl;
+    const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
+    while (!gl.isContextLost()) {
+      await new Promise(resolve => setTimeout(resolve, FENCE_POLL_MS));
+      if (fence === null || gl.getSyncParameter(fence, gl.SYNC_STATUS) === gl.SIGNALED) {
+        gl.deleteSync(fence);
+        return !gl.isContextLost();
+      }
+    }
+    return false;
   }
 
   // Sum and transmittance of one pixel of a target.

@@ -6,9 +6,10 @@ import { Lines } from "./lines.js";
 import { Sorter } from "./sorter.js";
 
 // The picture is coarser while it moves on an adapter that takes longer than this for a frame.
-const SLOW_FRAME_MS = 55;
-const FAST_FRAME_MS = 22;
-const COARSEST = 0.35;
+const MOVING_FRAME_MS = 45;
+const QUALITIES = [1, 0.7, 0.5, 0.3];
+// A finer picture must promise this much room, so that the picture does not change size all the time.
+const QUALITY_SLACK = 1.15;
 const REST_MS = 140;
 const MAX_PIXEL_RATIO = 2;
 // Share of the picture beyond its edges that is sorted too: it comes into sight before the next order does.
@@ -31,6 +32,11 @@ export class Stage {
     this.most = 1;
     this.frameMs = null;
     this.quality = 1;
+    this.drawnQuality = 1;
+    this.tookMs = 0;
+    this.movedAt = 0;
+    this.drawing = false;
+    this.again = false;
     this.waiting = 0;
     this.lastFrame = 0;
     this.gl = openGl(canvas);
@@ -66,6 +72,7 @@ export class Stage {
     this.lines.restore(this.gl);
     this.store.markAll();
     this.held = -1;
+    this.drawing = false;
     this.main.view = null;
     this.main.version = -1;
     this.lost = false;
@@ -83,7 +90,8 @@ export class Stage {
   // Width and height of the canvas's pixels, after what the page gives it.
   measure() {
     const ratio = Math.min(devicePixelRatio || 1, MAX_PIXEL_RATIO);
-    return { width: Math.max(1, Math.round(this.canvas.clientWidth * ratio)), height: Math.max(1, Math.round(this.canvas.clientHeight * ratio)), ratio };
+    const pixels = length => Math.max(1, Math.round(length * ratio));
+    return { width: pixels(this.canvas.clientWidth), height: pixels(this.canvas.clientHeight), ratio };
   }
 
   view() {
@@ -96,13 +104,16 @@ export class Stage {
     if (this.lost) {
       return;
     }
+    // The adapter still draws: another frame now would only queue up.
+    if (this.drawing) {
+      this.again = true;
+      return;
+    }
     const elapsed = now - this.lastFrame;
     const continuous = this.wasMoving && elapsed < 1000;
     const moving = this.hooks.advance(now, continuous ? elapsed / 1000 : 1 / 60);
     this.lastFrame = now;
-    if (continuous) {
-      this.frameMs = this.frameMs === null ? elapsed : 0.8 * this.frameMs + 0.2 * elapsed;
-    }
+    this.began = performance.now();
     const view = this.view();
     if (this.canvas.width !== view.camera.width || this.canvas.height !== view.camera.height) {
       this.canvas.width = view.camera.width;
@@ -113,33 +124,49 @@ export class Stage {
     this.wasMoving = moving;
     this.requestSort(view);
     this.render(view);
+    this.watch();
     this.hooks.drawn(view);
     if (moving) {
       this.invalidate();
     }
   }
 
-  // Coarse while the camera moves and frames are slow, full as soon as it rests.
+  // Waits until the adapter has done the frame; takes its time.
+  async watch() {
+    this.drawing = true;
+    const done = await this.renderer.signalled();
+    this.drawing = false;
+    if (!done) {
+      return;
+    }
+    // A frame with new lines alone tells nothing.
+    if (this.blended) {
+      this.blended = false;
+      this.tookMs = performance.now() - this.began;
+      this.frameMs = this.frameMs === null ? this.tookMs : 0.7 * this.frameMs + 0.3 * this.tookMs;
+    }
+    if (this.again) {
+      this.again = false;
+      this.invalidate();
+    }
+  }
+
+  // Coarse while the camera or the map changes and frames are slow, full as soon as they rest.
   chooseQuality(now, view, continuous) {
-    const moved = !this.lastView || this.lastView.rows.some((v, i) => v !== view.rows[i]);
+    const moved = !this.lastView || this.lastHeld !== this.held || this.lastView.rows.some((v, i) => v !== view.rows[i]);
     this.lastView = view;
+    this.lastHeld = this.held;
     clearTimeout(this.restTimer);
     if (moved) {
-      if (now - (this.movedAt || 0) < 400) {
-        const took = now - this.movedAt;
-        this.pace = this.pace === undefined ? took : 0.7 * this.pace + 0.3 * took;
-      }
       this.movedAt = now;
-      if (this.pace > SLOW_FRAME_MS) {
-        this.movingQuality = Math.max(COARSEST, (this.movingQuality || 1) * 0.8);
-      } else if (this.pace < FAST_FRAME_MS) {
-        this.movingQuality = Math.min(1, (this.movingQuality || 1) * 1.1);
-      }
-      this.quality = this.movingQuality || 1;
+      // The time goes with the number of pixels, that is with the square of the quality.
+      const ideal = this.drawnQuality * Math.sqrt(MOVING_FRAME_MS / Math.max(this.tookMs, 1));
+      const fits = quality => quality * (quality > this.quality ? QUALITY_SLACK : 1) <= ideal;
+      this.quality = QUALITIES.find(fits) || QUALITIES[QUALITIES.length - 1];
       if (this.quality < 1) {
         this.restTimer = setTimeout(() => this.rest(), REST_MS);
       }
-    } else if (now - (this.movedAt || 0) >= REST_MS - 20 && !continuous) {
+    } else if (now - this.movedAt >= REST_MS - 20 && !continuous) {
       this.quality = 1;
     } else if (this.quality < 1) {
       this.restTimer = setTimeout(() => this.rest(), REST_MS);
@@ -244,6 +271,8 @@ export class Stage {
     if (key !== this.drawnKey && (this.main.version === this.held || !this.renderer.targets.main)) {
       this.renderer.blend("main", drawn, this.shown, range);
       this.drawnKey = key;
+      this.drawnQuality = quality;
+      this.blended = true;
     }
     this.renderer.resolve("main", null, width, height, this.backgroundColor(), this.shown !== SHOWN_COLOR);
     this.lines.update(this.scene, this.store, this.layers, this.chosen, this.marked);
@@ -252,7 +281,7 @@ export class Stage {
 
   // Whether the canvas shows all that was taken, in the right order.
   get settled() {
-    return !this.store || this.lost || (!this.waiting && !this.main.flying && this.quality === 1 && this.held === this.store.version
+    return !this.store || this.lost || (!this.waiting && !this.drawing && !this.main.flying && this.quality === 1 && this.held === this.store.version
       && this.main.version === this.held && sameView(this.main.view, this.view()));
   }
 
@@ -282,7 +311,8 @@ export class Stage {
     if (!this.store || !(await this.blendAside(viewOf(pose, camera), SHOWN_COLOR, [0, 1]))) {
       return null;
     }
-    return { width, height, rgba: this.renderer.readBytes("side", width, height) };
+    const rgba = await this.renderer.readBytes("side", width, height);
+    return rgba && { width, height, rgba };
   }
 
   // Point of the map under a pixel of the canvas, in the world; null where there is nothing.

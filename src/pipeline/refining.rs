@@ -1,0 +1,174 @@
+//! The final refinement, round by round, and going on with it after a run's end.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Instant;
+
+use super::attending::Attending;
+use super::progress::{MappingProgress, RenderOrder, guarded};
+use super::{PipelineError, Progress};
+use crate::mapping::{FinalRefinement, KeyframeId, Mapper, MapperMessage};
+use crate::run_folder::{Checkpointer, KeyframeRecord, RunResult};
+use crate::splat::{Exposure, GaussianCloud};
+
+/// The map after a round of its refinement.
+pub(super) struct Round<'a> {
+    mapper: &'a mut Mapper,
+    attending: &'a Attending<'a>,
+    /// All optimisation steps so far.
+    pub steps: usize,
+}
+
+impl Round<'_> {
+    /// The map; `None` where the device fails, which the next step reports.
+    pub fn cloud(&mut self) -> Option<Arc<GaussianCloud>> {
+        self.attending.download(self.mapper).ok()?;
+        Some(self.attending.cloud())
+    }
+}
+
+/// The final refinement of a map.
+pub(super) struct Refining<'a> {
+    pub mapper: &'a mut Mapper,
+    pub refinement: &'a mut FinalRefinement,
+    /// Records of the mapped keyframes, whose exposures it measures again.
+    pub records: &'a mut [KeyframeRecord],
+    pub attending: &'a Attending<'a>,
+    pub progress: &'a Progress,
+    /// Steps of a round beyond the refinement's end.
+    pub extra_steps: usize,
+}
+
+impl Refining<'_> {
+    /// Refines to the end, and on where that is wanted; then downloads the map. `on_round` receives each round, and `checkpoints` writes it.
+    ///
+    /// # Errors
+    /// If the device fails or a step is not finite.
+    pub fn refine(mut self, checkpoints: &mut Checkpoints, on_round: &mut dyn FnMut(Round<'_>)) -> Result<(), PipelineError> {
+        let refined = guarded("mapping", || self.rounds(checkpoints, on_round));
+        let last = guarded("mapping", || Ok(self.attending.download(self.mapper)?));
+        refined.and(last)
+    }
+
+    fn rounds(&mut self, checkpoints: &mut Checkpoints, on_round: &mut dyn FnMut(Round<'_>)) -> Result<(), PipelineError> {
+        let Self { mapper, refinement, records, attending, progress, .. } = self;
+        loop {
+            let stop = || progress.stopped();
+            let Some(report) = mapper.refine(refinement, &attending.until(&stop))? else {
+                if progress.stopped() || !progress.control().refines_on() || mapper.gaussians() == 0 {
+                    return Ok(());
+                }
+                refinement.extend(self.extra_steps);
+                continue;
+            };
+            tracing::debug!(?report, "refined");
+            expose(records, &mapper.exposures().collect());
+            let figures = figures(mapper, records.len(), report.psnr_db);
+            attending.changed();
+            attending.publish(MappingProgress { refinement: Some(refinement.steps()), ..figures });
+            progress.control().finished_one();
+            attending.attend(mapper)?;
+            let steps = mapper.step_times().len();
+            on_round(Round { mapper, attending, steps });
+            if !progress.stopped() {
+                checkpoints.finished_one(mapper, Some(refinement), records);
+            }
+        }
+    }
+}
+
+/// Takes the exposures of keyframes into their records.
+fn expose(records: &mut [KeyframeRecord], exposures: &BTreeMap<KeyframeId, Exposure>) {
+    for KeyframeRecord { report, .. } in records {
+        report.exposure = exposures.get(&report.id).copied().unwrap_or(report.exposure);
+    }
+}
+
+/// The figures of the map after a keyframe or a round.
+pub(super) fn figures(mapper: &Mapper, keyframes: usize, psnr_db: f32) -> MappingProgress {
+    let times = mapper.step_times();
+    let step_ms = times.last().map_or(0.0, |time| time.as_secs_f64() * 1e3);
+    MappingProgress { keyframes, gaussians: mapper.gaussians(), steps: times.len(), psnr_db, step_ms, refinement: None }
+}
+
+/// Duration of each step, milliseconds.
+pub(super) fn step_ms(mapper: &Mapper) -> Vec<f64> {
+    mapper.step_times().iter().map(|t| t.as_secs_f64() * 1e3).collect()
+}
+
+/// A mapper that outlives its run, so that the refinement can go on.
+#[derive(Debug)]
+pub struct KeptMapper {
+    pub(super) mapper: Mapper,
+    pub(super) refinement: FinalRefinement,
+    pub(super) extra_steps: usize,
+}
+
+impl KeptMapper {
+    /// Renders the views that are ordered.
+    pub fn attend(&mut self, progress: &Progress) {
+        while let Some(RenderOrder { camera, reply }) = progress.next_order() {
+            reply(self.mapper.render(&camera).map_err(|error| error.to_string()));
+        }
+    }
+
+    /// Goes on with the refinement of a finished run until that is switched off or the run is stopped; the result gets the map, its times and
+    /// exposures.
+    ///
+    /// # Errors
+    /// If the device fails or a step is not finite; the result has the map before that.
+    pub fn refine_on(&mut self, result: &mut RunResult, progress: &Progress) -> Result<(), PipelineError> {
+        let started = Instant::now();
+        let attending = Attending::new(progress, result.cloud.clone());
+        let refining = Refining {
+            mapper: &mut self.mapper,
+            refinement: &mut self.refinement,
+            records: &mut result.history.keyframes,
+            attending: &attending,
+            progress,
+            extra_steps: self.extra_steps,
+        };
+        let refined = refining.refine(&mut Checkpoints::none(), &mut |_| ());
+        result.cloud = attending.cloud();
+        result.step_ms = step_ms(&self.mapper);
+        result.wall_s += started.elapsed().as_secs_f64();
+        refined
+    }
+}
+
+/// The run's checkpointer, if any. A checkpoint that fails does not end the run.
+pub(super) struct Checkpoints {
+    checkpointer: Option<Checkpointer>,
+    failed: bool,
+}
+
+impl Checkpoints {
+    /// None are written.
+    pub fn none() -> Self {
+        Self::new(None)
+    }
+
+    pub fn new(checkpointer: Option<Checkpointer>) -> Self {
+        Self { checkpointer, failed: false }
+    }
+
+    /// The mapper has received a message.
+    pub fn received(&mut self, message: &MapperMessage) {
+        self.checkpointer.iter_mut().for_each(|c| c.received(message));
+    }
+
+    /// A keyframe or a round is over.
+    pub fn finished_one(&mut self, mapper: &Mapper, refinement: Option<&FinalRefinement>, records: &[KeyframeRecord]) {
+        let Some(checkpointer) = &mut self.checkpointer else { return };
+        let began = Instant::now();
+        match guarded("mapping", || Ok(checkpointer.finished_one(mapper, refinement, records)?)) {
+            Ok(None) => {}
+            Ok(Some(bytes)) => tracing::debug!(bytes, ms = began.elapsed().as_secs_f64() * 1e3, "checkpoint written"),
+            Err(error) if !self.failed => {
+                self.failed = true;
+                tracing::warn!("{error}; the run goes on, and the checkpoint before this one stays");
+            }
+            Err(_) => {}
+        }
+    }
+}
