@@ -7,6 +7,7 @@ mod check;
 mod demo;
 mod eval;
 mod generate;
+mod keys;
 mod progress;
 mod render;
 mod report;

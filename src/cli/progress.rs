@@ -5,6 +5,7 @@ use keysplat::Progress;
 use miette::IntoDiagnostic;
 
 use super::Verbosity;
+use super::keys::Keys;
 
 /// A bar in the given template; hidden where nothing should be shown.
 pub fn bar(verbosity: Verbosity, len: u64, template: &str) -> ProgressBar {
@@ -27,7 +28,8 @@ pub fn spinner(verbosity: Verbosity, template: &str) -> ProgressBar {
 pub fn stop_on_ctrl_c(progress: &Progress) -> miette::Result<()> {
     let progress = progress.clone();
     ctrlc::set_handler(move || {
-        if progress.control().stop() {
+        if progress.control().interrupt() {
+            Keys::restore();
             std::process::exit(130);
         }
         tracing::warn!("finishing with what there is; press Ctrl-C again to quit at once");

@@ -16,6 +16,7 @@ use keysplat::{Config, Gpu, Metrics, Progress, Recording, Session, SessionError}
 use miette::{IntoDiagnostic, miette};
 
 use super::calibrate::{self, find_camera};
+use super::keys::{Keys, steer};
 use super::source::SourceArgs;
 use super::view::{ViewOptions, Viewed};
 use super::{Verbosity, print_metrics, progress};
@@ -101,6 +102,8 @@ fn parse_bytes(text: &str) -> Result<u64, String> {
 
 /// Host memory that the tracker has at least.
 const LEAST_TRACKING_BYTES: u64 = 64 << 20;
+/// How often the bar is brought up to date.
+const LOOK_EVERY: Duration = Duration::from_millis(100);
 /// Where a range without an end ends; TOML's numbers go no further.
 const OPEN_END: usize = i64::MAX as usize;
 
@@ -201,6 +204,8 @@ pub fn replay(mut session: Session, view: &ViewOptions, verbosity: Verbosity) ->
         })
     };
     let mut replayed = shown(&mut || session.run(&progress)).into_diagnostic()?;
+    // A longer refinement does not make an unfinished run a finished one.
+    let stopped = replayed.stopped;
     loop {
         viewed.iter().for_each(Viewed::measuring);
         let mut kept = replayed.kept.take().map(|kept| (kept, replayed.result.clone()));
@@ -214,7 +219,7 @@ pub fn replay(mut session: Session, view: &ViewOptions, verbosity: Verbosity) ->
         viewed.refining();
         let mut refine = || {
             let error = kept.refine_on(&mut result, &progress).err();
-            Ok(Replay { result: result.clone(), error, kept: None, stopped: false })
+            Ok(Replay { result: result.clone(), error, kept: None, stopped })
         };
         replayed = shown(&mut refine).into_diagnostic()?;
         replayed.kept = Some(kept);
@@ -238,14 +243,18 @@ fn print_end(finished: Result<Metrics, SessionError>, verbosity: Verbosity) -> m
     }
 }
 
-/// Keeps the bar up to date until the run is done.
+/// Keeps the bar up to date, and heeds keys, until the run is done.
 fn show(progress: &Progress, bar: &ProgressBar, done: &AtomicBool) {
+    let keys = if bar.is_hidden() { None } else { Keys::listen() };
     let mut outlook = Outlook::new(bar.length().unwrap_or(0) as usize);
     while !done.load(Ordering::Relaxed) {
         let state = outlook.look(progress);
         bar.set_position(state.frames as u64);
         bar.set_message(state.line());
-        std::thread::sleep(Duration::from_millis(100));
+        match &keys {
+            Some(keys) => keys.wait(LOOK_EVERY).into_iter().for_each(|key| steer(key, progress)),
+            None => std::thread::sleep(LOOK_EVERY),
+        }
     }
     bar.finish_and_clear();
 }

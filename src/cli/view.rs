@@ -101,15 +101,12 @@ impl Viewed {
     pub fn wants_more(&self, progress: &Progress, mut kept: Option<&mut KeptMapper>) -> bool {
         self.live.done();
         let control = progress.control();
-        if self.live.viewers() == 0 {
+        if !self.live.was_watched() {
             return false;
         }
         tracing::info!("all results are written; the view stays open while somebody looks, or until Ctrl-C");
-        control.refine_on(false);
-        let was_stopped = progress.stopped();
-        let is_interrupted = || progress.stopped() && !was_stopped;
         let mut last_seen = Instant::now();
-        while last_seen.elapsed() < GONE_AFTER && !is_interrupted() {
+        while last_seen.elapsed() < GONE_AFTER && !control.is_interrupted() {
             if control.refines_on() {
                 control.restart();
                 return true;

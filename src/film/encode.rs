@@ -60,6 +60,15 @@ pub enum FilmError {
     },
 }
 
+/// A file that is not whole; removed unless it gets its name.
+struct Partial(PathBuf);
+
+impl Drop for Partial {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_file(&self.0);
+    }
+}
+
 /// A moving picture that is being written.
 pub struct Film {
     path: PathBuf,
@@ -67,7 +76,7 @@ pub struct Film {
 }
 
 enum Form {
-    Video { writer: VideoWriter, partial: PathBuf },
+    Video { writer: VideoWriter, partial: Partial },
     Gif { encoder: Encoder<Vec<u8>>, delay: u16 },
     Pictures { count: usize },
 }
@@ -124,7 +133,7 @@ impl Film {
         match form {
             Form::Video { mut writer, partial } => {
                 writer.release().map_err(|source| FilmError::Video { path: path.clone(), source })?;
-                std::fs::rename(&partial, &path).map_err(|source| FilmError::Rename { path, source })
+                std::fs::rename(&partial.0, &path).map_err(|source| FilmError::Rename { path, source })
             }
             Form::Gif { encoder, .. } => {
                 let bytes = encoder.into_inner().map_err(|e| FilmError::Picture { path: path.clone(), reason: e.to_string() })?;
@@ -144,16 +153,15 @@ fn numbered(path: &Path, number: usize) -> PathBuf {
 fn video(path: &Path, (width, height): (u32, u32), fps: f64) -> Result<Form, FilmError> {
     let error = |source| FilmError::Video { path: path.into(), source };
     let name = path.file_name().unwrap_or_default().to_string_lossy();
-    let partial = path.with_file_name(format!(".partial-{name}"));
+    let partial = Partial(path.with_file_name(format!(".partial-{name}")));
     let size = Size::new(width as i32, height as i32);
     for [a, b, c, d] in CODECS {
         let codec = VideoWriter::fourcc(a, b, c, d).map_err(error)?;
-        let writer = VideoWriter::new(&partial, codec, fps, size, true).map_err(error)?;
+        let writer = VideoWriter::new(&partial.0, codec, fps, size, true).map_err(error)?;
         if writer.is_opened().map_err(error)? {
             return Ok(Form::Video { writer, partial });
         }
     }
-    let _ = std::fs::remove_file(&partial);
     Err(FilmError::NoEncoder { path: path.into() })
 }
 

@@ -46,7 +46,14 @@ fn along(poses: &[StampedPose], count: usize) -> Vec<Se3> {
         let t = first.timestamp_s + share * (last.timestamp_s - first.timestamp_s);
         let start = poses.partition_point(|pose| pose.timestamp_s < t - TAILS * TREMOR_S);
         let end = poses.partition_point(|pose| pose.timestamp_s <= t + TAILS * TREMOR_S);
-        let near = if start < end { start..end } else { start.min(poses.len() - 1)..start.min(poses.len() - 1) + 1 };
+        if start == end {
+            // In a gap of the path the nearest pose stands.
+            let after = start.min(poses.len() - 1);
+            let away = |k: usize| (poses[k].timestamp_s - t).abs();
+            let before = after.saturating_sub(1);
+            return poses[if away(before) < away(after) { before } else { after }].world_from_camera;
+        }
+        let near = start..end;
         mean(poses[near].iter().map(|pose| {
             let off = (pose.timestamp_s - t) / TREMOR_S;
             ((-0.5 * off * off).exp(), pose.world_from_camera)
@@ -191,6 +198,16 @@ mod tests {
         for (pose, original) in through.iter().zip(&shaken.poses) {
             assert!((pose.inverse() * original.world_from_camera).translation.vector.norm() < 1e-9);
         }
+    }
+
+    #[test]
+    fn a_gap_of_the_path_is_bridged() {
+        let mut broken = circle(1.0);
+        broken.poses.iter_mut().skip(30).for_each(|pose| pose.timestamp_s += 100.0);
+        let path = poses(CameraPathKind::Trajectory, &broken, &Trajectory::default(), 200);
+        let known =
+            |pose: &Se3| broken.poses.iter().any(|k| (k.world_from_camera.inverse() * pose).translation.vector.norm() < 0.1);
+        assert!(path.iter().all(known));
     }
 
     #[test]

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use bytemuck::Pod;
 use wgpu::BufferUsages;
 
-use super::device::MemoryCount;
+use super::memory::MemoryCount;
 use super::readback::Part;
 use super::{Gpu, GpuError};
 

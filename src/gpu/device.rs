@@ -1,12 +1,12 @@
 //! Adapter choice, device creation, and errors that surface asynchronously.
 
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use serde::Serialize;
 use wgpu::{Backends, InstanceDescriptor, InstanceFlags};
 
+use super::memory::MemoryCount;
 use super::profile::Profiler;
 use super::traffic::Traffic;
 use super::upload::UploadStaging;
@@ -120,7 +120,7 @@ pub struct Gpu {
     pub queue: wgpu::Queue,
     /// Identity of the adapter.
     pub adapter: AdapterSummary,
-    failure: Arc<Mutex<Option<Failure>>>,
+    pub(super) failure: Arc<Mutex<Option<Failure>>>,
     pub(super) memory: Arc<MemoryCount>,
     pub(super) traffic: Traffic,
     /// For the next readback.
@@ -130,7 +130,7 @@ pub struct Gpu {
 }
 
 #[derive(Debug)]
-enum Failure {
+pub(super) enum Failure {
     OutOfMemory(String),
     Failed(String),
     Hung(Duration),
@@ -138,37 +138,6 @@ enum Failure {
 
 /// A batch of steps takes seconds even on a software adapter.
 const MAX_WAIT: Duration = Duration::from_secs(600);
-
-/// Bytes in our buffers, now and at most.
-#[derive(Debug)]
-pub(super) struct MemoryCount {
-    now: AtomicU64,
-    peak: AtomicU64,
-    /// The most that there may be.
-    limit: AtomicU64,
-}
-
-impl Default for MemoryCount {
-    fn default() -> Self {
-        Self { now: AtomicU64::new(0), peak: AtomicU64::new(0), limit: AtomicU64::new(u64::MAX) }
-    }
-}
-
-impl MemoryCount {
-    pub(super) fn add(&self, bytes: u64) {
-        let now = self.now.fetch_add(bytes, Ordering::Relaxed) + bytes;
-        self.peak.fetch_max(now, Ordering::Relaxed);
-    }
-
-    pub(super) fn remove(&self, bytes: u64) {
-        self.now.fetch_sub(bytes, Ordering::Relaxed);
-    }
-
-    /// Whether so many bytes more would exceed the limit.
-    pub(super) fn is_beyond(&self, bytes: u64) -> bool {
-        self.now.load(Ordering::Relaxed).saturating_add(bytes) > self.limit.load(Ordering::Relaxed)
-    }
-}
 
 fn instance() -> wgpu::Instance {
     let mut descriptor = InstanceDescriptor::new_without_display_handle_from_env();
@@ -339,21 +308,6 @@ impl Gpu {
             Err(error) => return Err(GpuError::Failed(error.to_string())),
         }
         self.check()
-    }
-
-    /// From now on buffers of more than `bytes` in all are refused as an adapter of so much memory would.
-    pub fn limit_memory(&self, bytes: u64) {
-        self.memory.limit.store(bytes, Ordering::Relaxed);
-    }
-
-    /// Bytes that our buffers hold now.
-    pub fn bytes(&self) -> u64 {
-        self.memory.now.load(Ordering::Relaxed)
-    }
-
-    /// The most bytes that our buffers held at any time.
-    pub fn peak_bytes(&self) -> u64 {
-        self.memory.peak.load(Ordering::Relaxed)
     }
 }
 

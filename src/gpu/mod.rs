@@ -3,6 +3,7 @@
 mod buffer;
 mod device;
 mod kernel;
+mod memory;
 pub mod plain;
 mod profile;
 mod readback;

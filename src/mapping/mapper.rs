@@ -180,6 +180,16 @@ impl Mapper {
         Ok(self.trainer.render(&self.cloud, camera, [0.0; 3])?)
     }
 
+    /// The Gaussians on the GPU, to be rendered by others.
+    pub fn map(&self) -> &GpuCloud {
+        &self.cloud
+    }
+
+    /// The device that it works on.
+    pub fn gpu(&self) -> &Arc<Gpu> {
+        &self.gpu
+    }
+
     /// Duration of each step so far: its share of its batch.
     pub fn step_times(&self) -> &[Duration] {
         &self.step_times

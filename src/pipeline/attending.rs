@@ -7,17 +7,21 @@ use std::time::{Duration, Instant};
 
 use super::Progress;
 use super::progress::{MappingProgress, RenderOrder};
+use crate::gpu::GpuError;
 use crate::mapping::{Interlude, Mapper, MappingError};
-use crate::splat::{GaussianCloud, MapSnapshot};
+use crate::render::{Rasterizer, Rendered};
+use crate::splat::{GaussianCloud, MapSnapshot, ViewCamera};
 
 /// Snapshots for viewers take at most one part in so many of the mapper's time, at most one in this time:
 const SNAPSHOT_SHARE: u32 = 100;
 const SNAPSHOT_EVERY: Duration = Duration::from_millis(250);
 /// Those that are kept in case the device fails are as old as this at most, and one part in so many of the time.
 const KEPT_SHARE: u32 = 20;
-const KEPT_EVERY: Duration = Duration::from_secs(10);
+const KEPT_EVERY: Duration = Duration::from_secs(1);
 /// Ordered views take at most one part in so many of its time.
 const RENDER_SHARE: u32 = 10;
+/// Intersections of an ordered view, at most: a picture from close by is refused before it fills the GPU's memory.
+const MOST_INTERSECTIONS: usize = 1 << 22;
 
 /// Work that may take a share of the time.
 #[derive(Debug, Default)]
@@ -54,11 +58,16 @@ struct State {
     is_stale: bool,
     snapshots: Share,
     renders: Share,
+    renderer: OrderRenderer,
     figures: MappingProgress,
 }
 
 impl<'a> Attending<'a> {
+    /// `cloud` is the map so far.
     pub fn new(progress: &'a Progress, cloud: Arc<GaussianCloud>) -> Self {
+        if !cloud.is_empty() {
+            progress.snapshots().put(MapSnapshot { cloud: cloud.clone(), keyframes: 0, psnr_db: 0.0 });
+        }
         Self { progress, state: RefCell::new(State { cloud, ..State::default() }) }
     }
 
@@ -67,7 +76,7 @@ impl<'a> Attending<'a> {
         self.state.borrow().cloud.clone()
     }
 
-    /// The map has changed.
+    /// Marks the newest download as out of date.
     pub fn changed(&self) {
         self.state.borrow_mut().is_stale = true;
     }
@@ -79,22 +88,22 @@ impl<'a> Attending<'a> {
     }
 
     /// Renders what is ordered and downloads what is wanted, within their shares of the time.
-    pub fn attend(&self, mapper: &mut Mapper) -> Result<(), MappingError> {
+    pub fn attend(&self, mapper: &Mapper) -> Result<(), MappingError> {
         let mut state = self.state.borrow_mut();
         let wanted = self.progress.snapshots().is_wanted() && state.snapshots.is_due(SNAPSHOT_SHARE, SNAPSHOT_EVERY);
         if state.is_stale && (wanted || state.snapshots.is_due(KEPT_SHARE, KEPT_EVERY)) {
             state.download(mapper, self.progress)?;
         }
         if self.progress.has_order() && state.renders.is_due(RENDER_SHARE, Duration::ZERO) {
-            let Some(RenderOrder { camera, reply }) = self.progress.next_order() else { return Ok(()) };
-            let rendered = state.renders.take(|| mapper.render(&camera));
-            reply(rendered.map_err(|error| error.to_string()));
+            let Some(order) = self.progress.next_order() else { return Ok(()) };
+            let State { renders, renderer, .. } = &mut *state;
+            renders.take(|| renderer.answer(mapper, order));
         }
         Ok(())
     }
 
     /// Downloads the map unless it has not changed.
-    pub fn download(&self, mapper: &mut Mapper) -> Result<(), MappingError> {
+    pub fn download(&self, mapper: &Mapper) -> Result<(), MappingError> {
         let mut state = self.state.borrow_mut();
         if state.is_stale { state.download(mapper, self.progress) } else { Ok(()) }
     }
@@ -108,19 +117,35 @@ impl<'a> Attending<'a> {
     }
 
     /// Attends while the run is held.
-    pub fn while_paused(&self, mapper: &mut Mapper) -> Result<(), MappingError> {
-        let mut attended = Ok(());
-        self.progress.control().wait_while_paused(|| {
-            if attended.is_ok() {
-                attended = self.attend(mapper);
-            }
-        });
-        attended
+    pub fn while_paused(&self, mapper: &Mapper) -> Result<(), MappingError> {
+        self.progress.control().wait_while_paused(|| self.attend(mapper)).map(drop)
+    }
+}
+
+/// Renders ordered views with buffers of its own: those of the mapper decide which steps are repeated, and its memory may be bounded.
+#[derive(Debug, Default)]
+pub(super) struct OrderRenderer {
+    rasterizer: Option<Rasterizer>,
+}
+
+impl OrderRenderer {
+    /// Renders an ordered view of the map as it is now.
+    pub fn answer(&mut self, mapper: &Mapper, RenderOrder { camera, reply }: RenderOrder) {
+        reply(self.render(mapper, &camera).map_err(|error| error.to_string()));
+    }
+
+    fn render(&mut self, mapper: &Mapper, camera: &ViewCamera) -> Result<Rendered, GpuError> {
+        if self.rasterizer.is_none() {
+            let rasterizer = Rasterizer::new(mapper.gpu().beside())?;
+            self.rasterizer = Some(rasterizer.with_most_intersections(MOST_INTERSECTIONS));
+        }
+        let rasterizer = self.rasterizer.as_mut().expect("it was just made");
+        rasterizer.render(mapper.map(), camera, [0.0; 3])
     }
 }
 
 impl State {
-    fn download(&mut self, mapper: &mut Mapper, progress: &Progress) -> Result<(), MappingError> {
+    fn download(&mut self, mapper: &Mapper, progress: &Progress) -> Result<(), MappingError> {
         self.cloud = Arc::new(self.snapshots.take(|| mapper.download())?);
         self.is_stale = false;
         let MappingProgress { keyframes, psnr_db, .. } = self.figures;
@@ -135,7 +160,7 @@ struct Until<'a, 'b> {
 }
 
 impl Interlude for Until<'_, '_> {
-    fn between(&self, mapper: &mut Mapper) -> Result<ControlFlow<()>, MappingError> {
+    fn between(&self, mapper: &Mapper) -> Result<ControlFlow<()>, MappingError> {
         // Steps were taken since the last time.
         self.attending.changed();
         self.attending.attend(mapper)?;

@@ -1,26 +1,32 @@
 //! Switches of a run: pause, step, finish, refine on.
 
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
 use std::time::{Duration, Instant};
 
 /// How often a paused thread looks.
 const LOOK_EVERY: Duration = Duration::from_millis(10);
 
+const GOING: u8 = 0;
+/// Pauses after the next keyframe or round of the refinement.
+const STEPPING: u8 = 1;
+const PAUSED: u8 = 2;
+
 /// Switches of a run, for any thread to set.
 #[derive(Debug, Default)]
 pub struct Control {
     stopped: AtomicBool,
-    paused: AtomicBool,
-    /// Pause again after the next keyframe or round of the refinement.
-    stepping: AtomicBool,
+    interrupted: AtomicBool,
+    /// [`GOING`], [`STEPPING`] or [`PAUSED`].
+    pace: AtomicU8,
     refining_on: AtomicBool,
     keeping: AtomicBool,
 }
 
 impl Control {
-    /// Ends the run early; its partial result is returned. Whether it had been ended before.
-    pub fn stop(&self) -> bool {
-        self.stopped.swap(true, Ordering::Relaxed)
+    /// Ends the run early; its partial result is returned.
+    pub fn stop(&self) {
+        self.refine_on(false);
+        self.stopped.store(true, Ordering::Relaxed);
     }
 
     /// Whether the run is to end early.
@@ -28,9 +34,21 @@ impl Control {
         self.stopped.load(Ordering::Relaxed)
     }
 
-    /// Takes a stop back, so that the refinement of a finished run can go on.
+    /// Ends the run early, and whatever would follow it; returns whether that was done before.
+    pub fn interrupt(&self) -> bool {
+        self.stop();
+        self.interrupted.swap(true, Ordering::Relaxed)
+    }
+
+    /// Whether the program is to end.
+    pub fn is_interrupted(&self) -> bool {
+        self.interrupted.load(Ordering::Relaxed)
+    }
+
+    /// Takes a stop and a pause back, so that the refinement of a finished run can go on.
     pub fn restart(&self) {
-        self.stopped.store(false, Ordering::Relaxed);
+        self.resume();
+        self.stopped.store(self.is_interrupted(), Ordering::Relaxed);
     }
 
     /// Keeps the mapper beyond the run's end.
@@ -45,31 +63,28 @@ impl Control {
 
     /// Holds the run before its next frame and its next batch of steps.
     pub fn pause(&self) {
-        self.paused.store(true, Ordering::Relaxed);
+        self.pace.store(PAUSED, Ordering::Relaxed);
     }
 
     /// Lets a paused run go on.
     pub fn resume(&self) {
-        self.stepping.store(false, Ordering::Relaxed);
-        self.paused.store(false, Ordering::Relaxed);
+        self.pace.store(GOING, Ordering::Relaxed);
     }
 
     /// Whether the run is held.
     pub fn is_paused(&self) -> bool {
-        self.paused.load(Ordering::Relaxed) && !self.is_stopped()
+        self.pace.load(Ordering::Relaxed) == PAUSED && !self.is_stopped()
     }
 
     /// Lets the run go on until the next keyframe is mapped, or the next round of the refinement is over.
     pub fn step(&self) {
-        self.stepping.store(true, Ordering::Relaxed);
-        self.paused.store(false, Ordering::Relaxed);
+        self.pace.store(STEPPING, Ordering::Relaxed);
     }
 
-    /// A keyframe or a round is over.
+    /// Ends a step, after a keyframe or a round.
     pub(super) fn finished_one(&self) {
-        if self.stepping.swap(false, Ordering::Relaxed) {
-            self.pause();
-        }
+        // Whoever has let the run go on meanwhile prevails.
+        let _ = self.pace.compare_exchange(STEPPING, PAUSED, Ordering::Relaxed, Ordering::Relaxed);
     }
 
     /// Goes on refining when the refinement is over, until the run is stopped or this is switched off.
@@ -82,17 +97,17 @@ impl Control {
         self.refining_on.load(Ordering::Relaxed)
     }
 
-    /// Waits while the run is held, and does what comes meanwhile; returns for how long.
-    pub(super) fn wait_while_paused(&self, mut meanwhile: impl FnMut()) -> Duration {
+    /// Waits while the run is held, and does what comes `meanwhile`, whose error ends the wait; returns for how long it waited.
+    pub(super) fn wait_while_paused<E>(&self, mut meanwhile: impl FnMut() -> Result<(), E>) -> Result<Duration, E> {
         if !self.is_paused() {
-            return Duration::ZERO;
+            return Ok(Duration::ZERO);
         }
         let began = Instant::now();
         while self.is_paused() {
-            meanwhile();
+            meanwhile()?;
             std::thread::sleep(LOOK_EVERY);
         }
-        began.elapsed()
+        Ok(began.elapsed())
     }
 }
 
@@ -100,26 +115,42 @@ impl Control {
 mod tests {
     use super::*;
 
+    fn wait(control: &Control, looks: usize) -> usize {
+        let mut seen = 0;
+        let waited = control.wait_while_paused(|| {
+            seen += 1;
+            if seen == looks { Err(()) } else { Ok(()) }
+        });
+        assert_eq!(waited.is_err(), seen == looks && looks > 0);
+        seen
+    }
+
     #[test]
     fn a_step_ends_in_a_pause() {
         let control = Control::default();
-        assert_eq!(control.wait_while_paused(|| unreachable!()), Duration::ZERO);
+        assert_eq!(wait(&control, 3), 0);
         control.pause();
         control.step();
         assert!(!control.is_paused());
         control.finished_one();
         assert!(control.is_paused());
-        let mut looks = 0;
-        control.wait_while_paused(|| {
-            looks += 1;
-            if looks == 3 {
-                control.resume();
-            }
-        });
+        assert_eq!(wait(&control, 3), 3, "an error ends the wait");
+        control.resume();
         control.finished_one();
-        assert!(looks == 3 && !control.is_paused());
+        assert!(!control.is_paused());
+    }
+
+    #[test]
+    fn a_run_that_ends_is_held_no_longer() {
+        let control = Control::default();
         control.pause();
-        assert!(!control.stop() && control.stop());
-        assert!(control.is_stopped() && !control.is_paused(), "a run that ends is held no longer");
+        control.refine_on(true);
+        control.stop();
+        assert!(control.is_stopped() && !control.is_paused() && !control.refines_on() && !control.is_interrupted());
+        control.restart();
+        assert!(!control.is_stopped() && !control.is_paused());
+        assert!(!control.interrupt() && control.interrupt());
+        control.restart();
+        assert!(control.is_stopped(), "an interruption is not taken back");
     }
 }

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use crossbeam::channel::{Receiver, RecvTimeoutError};
 
-use super::attending::Attending;
+use super::attending::{Attending, OrderRenderer};
 use super::progress::guarded;
 use super::read_thread::QueuedFrame;
 use super::refining::{Checkpoints, KeptMapper, Refining, Round, figures, step_ms};
@@ -76,7 +76,7 @@ impl MapThread<'_> {
         let mapped = self.map_messages(&mut mapper, &mut summary, &attending, &mut checkpoints);
         summary.error = mapped.err();
         // Also after an error: a device that still answers gives all that was mapped.
-        let last = guarded("mapping", || Ok(attending.download(&mut mapper)?));
+        let last = guarded("mapping", || Ok(attending.download(&mapper)?));
         summary.error = summary.error.or(last.err());
         if summary.error.is_none() && mapper.has_not_begun() && !summary.keyframes.is_empty() {
             summary.error = Some(MappingError::NoDepth.into());
@@ -86,7 +86,12 @@ impl MapThread<'_> {
             (summary.step_ms, summary.cloud) = (step_ms(&mapper), attending.cloud());
             match refined {
                 Ok(refinement) if self.progress.control().keeps_mapper() => {
-                    summary.kept = Some(KeptMapper { mapper, refinement, extra_steps: self.extra_steps() });
+                    summary.kept = Some(KeptMapper {
+                        mapper,
+                        refinement,
+                        extra_steps: self.extra_steps(),
+                        renderer: OrderRenderer::default(),
+                    });
                 }
                 Ok(_) => {}
                 Err(error) => summary.error = Some(error),
@@ -170,8 +175,8 @@ impl MapThread<'_> {
         let earlier_s = summary.keyframes.last().map_or(0.0, |record| record.done_s);
         let started = Instant::now();
         let inbox = Inbox { messages: self.messages, ahead: RefCell::default() };
-        while let Some(message) = inbox.next(|| Ok(attending.attend(mapper)?))? {
-            attending.while_paused(mapper)?;
+        while let Some(message) = inbox.next(|| guarded("mapping", || Ok(attending.attend(mapper)?)))? {
+            guarded("mapping", || Ok(attending.while_paused(mapper)?))?;
             let (waiting, began) = (inbox.waiting(), Instant::now());
             let stop = || {
                 self.frames.into_iter().for_each(wait_for_tracker);

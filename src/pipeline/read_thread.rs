@@ -1,5 +1,6 @@
 //! Decodes frames and extracts their features ahead of the tracker, and keeps the replay's clock.
 
+use std::convert::Infallible;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
@@ -79,7 +80,7 @@ impl<'a> ReadThread<'a> {
                     return !self.progress.stopped();
                 }
             };
-            let pause = self.progress.control().wait_while_paused(|| ());
+            let pause = self.progress.control().wait_while_paused(|| Ok::<_, Infallible>(())).unwrap_or_default();
             held_ms.fetch_add(pause.as_millis() as u64, Ordering::Relaxed);
             if self.real_time {
                 std::thread::sleep(due(&queued.frame).saturating_sub(elapsed()));

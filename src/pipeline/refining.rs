@@ -4,8 +4,9 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Instant;
 
-use super::attending::Attending;
-use super::progress::{MappingProgress, RenderOrder, guarded};
+use super::attending::{Attending, OrderRenderer};
+use super::progress::{MappingProgress, guarded};
+use super::run::writable;
 use super::{PipelineError, Progress};
 use crate::mapping::{FinalRefinement, KeyframeId, Mapper, MapperMessage};
 use crate::run_folder::{Checkpointer, KeyframeRecord, RunResult};
@@ -45,9 +46,9 @@ impl Refining<'_> {
     /// # Errors
     /// If the device fails or a step is not finite.
     pub fn refine(mut self, checkpoints: &mut Checkpoints, on_round: &mut dyn FnMut(Round<'_>)) -> Result<(), PipelineError> {
-        let refined = guarded("mapping", || self.rounds(checkpoints, on_round));
-        let last = guarded("mapping", || Ok(self.attending.download(self.mapper)?));
-        refined.and(last)
+        // After an error the map is that of the last download: the one on the GPU may hold what is not finite.
+        guarded("mapping", || self.rounds(checkpoints, on_round))?;
+        guarded("mapping", || Ok(self.attending.download(self.mapper)?))
     }
 
     fn rounds(&mut self, checkpoints: &mut Checkpoints, on_round: &mut dyn FnMut(Round<'_>)) -> Result<(), PipelineError> {
@@ -55,7 +56,7 @@ impl Refining<'_> {
         loop {
             let stop = || progress.stopped();
             let Some(report) = mapper.refine(refinement, &attending.until(&stop))? else {
-                if progress.stopped() || !progress.control().refines_on() || mapper.gaussians() == 0 {
+                if progress.stopped() || !progress.control().refines_on() || mapper.gaussians() == 0 || records.is_empty() {
                     return Ok(());
                 }
                 refinement.extend(self.extra_steps);
@@ -102,13 +103,14 @@ pub struct KeptMapper {
     pub(super) mapper: Mapper,
     pub(super) refinement: FinalRefinement,
     pub(super) extra_steps: usize,
+    pub(super) renderer: OrderRenderer,
 }
 
 impl KeptMapper {
     /// Renders the views that are ordered.
     pub fn attend(&mut self, progress: &Progress) {
-        while let Some(RenderOrder { camera, reply }) = progress.next_order() {
-            reply(self.mapper.render(&camera).map_err(|error| error.to_string()));
+        while let Some(order) = progress.next_order() {
+            self.renderer.answer(&self.mapper, order);
         }
     }
 
@@ -129,7 +131,7 @@ impl KeptMapper {
             extra_steps: self.extra_steps,
         };
         let refined = refining.refine(&mut Checkpoints::none(), &mut |_| ());
-        result.cloud = attending.cloud();
+        result.cloud = writable(attending.cloud());
         result.step_ms = step_ms(&self.mapper);
         result.wall_s += started.elapsed().as_secs_f64();
         refined

@@ -13,9 +13,11 @@ use super::read_thread::{ReadSummary, ReadThread};
 use super::track_thread::{TrackSummary, TrackThread};
 use super::{KeptMapper, PipelineError, Progress};
 use crate::gpu::Gpu;
+use crate::mapping::KeyframeId;
 use crate::recording::Recording;
 use crate::run_folder::{Checkpointer, Elapsed, History, RunResult};
 use crate::splat::GaussianCloud;
+use crate::tracking::KeyframePose;
 
 /// Frames decoded ahead of the tracker. In real time these are due frames that wait: a slow frame, of a keyframe say, costs none of the next.
 pub(super) const FRAMES_AHEAD: usize = 8;
@@ -61,7 +63,12 @@ pub fn run(
             .name("mapping".into())
             .spawn_scoped(scope, move || {
                 let (messages, frames) = (&messages, waiting.as_ref());
-                MapThread { gpu, config: mapping, messages, frames, progress }.map(&mut |_| (), checkpointer)
+                let map = MapThread { gpu, config: mapping, messages, frames, progress }.map(&mut |_| (), checkpointer);
+                if map.error.is_some() {
+                    // The others see that the channel is closed once nothing holds them.
+                    progress.control().resume();
+                }
+                map
             })
             .map_err(spawn_error("mapping"))?;
         let track = Builder::new()
@@ -117,9 +124,9 @@ fn gather(
         cloud: writable(map.cloud),
         poses: track.trajectory,
         trajectory,
-        keyframes: track.keyframes,
         tracking_ms: track.frames.iter().map(|frame| frame.times.total_ms()).collect(),
-        history: History { frames: track.frames, keyframes: map.keyframes, loops: track.loops },
+        history: History { frames: track.frames, keyframes: map.keyframes, loops: places(&track.loops, &track.keyframes) },
+        keyframes: track.keyframes,
         frames_read_failed: read.read_failed,
         frames_late: read.late,
         keyframes_deferred: track.deferred,
@@ -131,8 +138,14 @@ fn gather(
     Replay { result, kept: map.kept, error: errors.into_iter().next(), stopped: false }
 }
 
+/// Loops by the places of their keyframes in the list; those of submaps that never joined are left out.
+fn places(loops: &[[KeyframeId; 2]], keyframes: &[KeyframePose]) -> Vec<[usize; 2]> {
+    let place = |id: &KeyframeId| keyframes.binary_search_by_key(id, |keyframe| keyframe.id).ok();
+    loops.iter().filter_map(|[a, b]| Some([place(a)?, place(b)?])).collect()
+}
+
 /// A map that every format can hold: Gaussians with a NaN or an infinity are left out, with a warning.
-fn writable(cloud: Arc<GaussianCloud>) -> Arc<GaussianCloud> {
+pub(super) fn writable(cloud: Arc<GaussianCloud>) -> Arc<GaussianCloud> {
     if cloud.first_non_finite().is_none() {
         return cloud;
     }

@@ -16,6 +16,9 @@ use crate::splat::{Exposure, ViewCamera};
 /// See [`depth_key`](crate::splat::model::depth_key).
 const DEPTH_KEY_BITS: u32 = 16;
 
+/// Sort keys and values twice, and the Gaussian.
+const INTERSECTION_BYTES: u64 = 20;
+
 /// A rendered view on the host.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Rendered {
@@ -74,6 +77,8 @@ pub struct Rasterizer {
     gpu: Arc<Gpu>,
     form: BlendForm,
     kernels: Kernels,
+    /// Views of more intersections are refused.
+    most_intersections: usize,
     count_mode: GpuBuffer,
     emit_mode: GpuBuffer,
     visible_scan: GpuBuffer,
@@ -128,6 +133,7 @@ impl Rasterizer {
         Ok(Self {
             form,
             kernels,
+            most_intersections: usize::MAX,
             count_mode: GpuBuffer::uniform(&gpu, "count mode", &TileListsSetup { emit: 0, pad: [0; 3] })?,
             emit_mode: GpuBuffer::uniform(&gpu, "emit mode", &TileListsSetup { emit: 1, pad: [0; 3] })?,
             visible_scan: scan("visible scan", VISIBLE_COUNTER)?,
@@ -136,6 +142,11 @@ impl Rasterizer {
             workspace: Workspace::new(&gpu, form)?,
             gpu,
         })
+    }
+
+    /// Refuses views of more intersections than this, instead of growing for them.
+    pub fn with_most_intersections(self, most: usize) -> Self {
+        Self { most_intersections: most, ..self }
     }
 
     /// The device that it runs on.
@@ -307,6 +318,11 @@ impl Rasterizer {
     /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn reserve_for(&mut self, counters: &[Counter]) -> Result<(), GpuError> {
         let needed = counters[INTERSECTION_COUNTER as usize].needed as usize;
+        if needed > self.most_intersections {
+            let bytes = |count: usize| count as u64 * INTERSECTION_BYTES;
+            let label = "intersections of the view".into();
+            return Err(GpuError::TooLarge { label, needed: bytes(needed), limit: bytes(self.most_intersections) });
+        }
         if needed > self.workspace.intersection_capacity {
             tracing::debug!(intersections = needed, "enlarging the intersection buffers");
             self.workspace.reserve_intersections(&self.gpu, needed)?;

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::mapping::{KeyframeId, KeyframeReport};
+use crate::mapping::KeyframeReport;
 use crate::tracking::StageTimes;
 
 /// Records of a run.
@@ -12,9 +12,9 @@ pub struct History {
     pub frames: Vec<FrameRecord>,
     /// In the order in which they were mapped.
     pub keyframes: Vec<KeyframeRecord>,
-    /// Closed loops: the keyframe that recognised a place, and the keyframe of that place.
+    /// Closed loops: the keyframe that recognised a place and that of the place, by their numbers among the run's keyframes.
     #[serde(default)]
-    pub loops: Vec<[KeyframeId; 2]>,
+    pub loops: Vec<[usize; 2]>,
 }
 
 /// One tracked frame.

@@ -1,8 +1,7 @@
 //! What viewers may see of a run or its files: the newest of each kind, which any number of connections read.
 
-use std::collections::VecDeque;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 use arc_swap::{ArcSwap, ArcSwapOption};
 use tokio::sync::watch;
@@ -27,7 +26,8 @@ pub struct Frames {
 /// Statistics so far; older ones are thinned.
 #[derive(Clone, Debug, Default)]
 pub struct History {
-    entries: VecDeque<Statistics>,
+    /// Each with its number.
+    entries: Vec<(usize, Statistics)>,
     /// Entries ever added.
     pub last: usize,
 }
@@ -38,24 +38,25 @@ impl History {
         const KEPT: usize = 16;
         if self.entries.len() >= MOST_STATISTICS {
             let old = self.entries.len() - KEPT;
-            let entries = self.entries.iter().enumerate().filter(|(k, _)| *k >= old || k.is_multiple_of(2));
-            self.entries = entries.map(|(_, entry)| *entry).collect();
+            let mut place = 0;
+            self.entries.retain(|_| {
+                place += 1;
+                place > old || place % 2 == 1
+            });
         }
-        self.entries.push_back(entry);
-        self.entries.make_contiguous();
         self.last += 1;
+        self.entries.push((self.last, entry));
     }
 
-    /// Entries after the `seen` first; all where none was seen, or more were added than are kept whole.
-    pub fn since(&self, seen: Option<usize>) -> &[Statistics] {
-        let entries = self.entries.as_slices().0;
-        let new = seen.map_or(entries.len(), |seen| (self.last - seen).min(entries.len()));
-        &entries[entries.len() - new..]
+    /// The entries that are kept of those after the `seen` first.
+    pub fn since(&self, seen: usize) -> Vec<Statistics> {
+        let start = self.entries.partition_point(|(number, _)| *number <= seen);
+        self.entries[start..].iter().map(|(_, entry)| *entry).collect()
     }
 
     /// The newest entry.
     pub fn newest(&self) -> Option<&Statistics> {
-        self.entries.back()
+        self.entries.last().map(|(_, entry)| entry)
     }
 }
 
@@ -85,6 +86,8 @@ pub struct Board {
     pub image: ArcSwapOption<NumberedImage>,
     /// Viewers connected.
     pub viewers: AtomicUsize,
+    /// Whether there has been a viewer.
+    pub was_watched: AtomicBool,
     /// Viewers that have all of the newest map, and would take another.
     pub ready: AtomicUsize,
     /// Viewers that want images of the newest frame.
@@ -103,6 +106,7 @@ impl Board {
             statistics: ArcSwap::default(),
             image: ArcSwapOption::empty(),
             viewers: AtomicUsize::new(0),
+            was_watched: AtomicBool::new(false),
             ready: AtomicUsize::new(0),
             watching: AtomicUsize::new(0),
             changed: watch::Sender::new(0),
@@ -128,4 +132,24 @@ impl Board {
 /// Replaces a value.
 pub fn put<T>(slot: &ArcSwapOption<T>, value: T) {
     slot.store(Some(Arc::new(value)));
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_history_is_thinned_and_nothing_is_sent_twice() {
+        let mut history = History::default();
+        let mut sent = Vec::new();
+        for s in 0..5000 {
+            let seen = history.last;
+            history.push(Statistics { s: f64::from(s), ..Statistics::default() });
+            sent.extend(history.since(seen));
+        }
+        assert_eq!(sent.iter().map(|entry| entry.s).collect::<Vec<_>>(), (0..5000).map(f64::from).collect::<Vec<_>>());
+        let whole = history.since(0);
+        assert!((MOST_STATISTICS / 2..=MOST_STATISTICS).contains(&whole.len()) && whole[0].s == 0.0);
+        assert!(whole.is_sorted_by(|a, b| a.s < b.s) && history.newest().unwrap().s == 4999.0);
+    }
 }

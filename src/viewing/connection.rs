@@ -36,6 +36,7 @@ pub(super) async fn attend(mut socket: WebSocket, service: &Arc<Service>, contro
         service,
         control,
         answers,
+        waiting: None,
         conduct: Conduct::default(),
     };
     let hello = Hello { control, ..board.hello.clone() };
@@ -44,9 +45,12 @@ pub(super) async fn attend(mut socket: WebSocket, service: &Arc<Service>, contro
     }
     loop {
         while let Some(message) = viewer.delivery.next(board) {
+            let (bytes, began) = (message.len(), Instant::now());
             if !send(&mut socket, message).await {
                 return;
             }
+            viewer.delivery.sent(bytes, began.elapsed());
+            viewer.conduct.last = Instant::now();
         }
         viewer.presence.update(&viewer.delivery);
         let going_on = tokio::select! {
@@ -54,7 +58,10 @@ pub(super) async fn attend(mut socket: WebSocket, service: &Arc<Service>, contro
                 Some(Ok(message)) => viewer.receive(message),
                 _ => false,
             },
-            Some(answer) = answered.recv() => send(&mut socket, answer).await,
+            Some(answer) = answered.recv() => {
+                viewer.retry();
+                send(&mut socket, answer).await
+            }
             change = changed.changed() => change.is_ok(),
             _ = pings.tick() => {
                 let is_there = viewer.conduct.last.elapsed() < PATIENCE;
@@ -75,12 +82,17 @@ async fn send(socket: &mut WebSocket, message: Outgoing) -> bool {
     matches!(timeout(PATIENCE, socket.send(message)).await, Ok(Ok(())))
 }
 
+/// Makes an answer, or says why there is none.
+type Work = Box<dyn FnOnce() -> Result<Outgoing, String> + Send>;
+
 struct Viewer<'a> {
     delivery: Delivery,
     presence: Presence<'a>,
     service: &'a Arc<Service>,
     control: bool,
     answers: mpsc::Sender<Outgoing>,
+    /// The newest request that has no place yet.
+    waiting: Option<(&'static str, Work)>,
     conduct: Conduct,
 }
 
@@ -116,18 +128,28 @@ impl Viewer<'_> {
         }
     }
 
-    /// Answers from a thread that may block. Beyond the answers under way, requests are dropped: newest wins at the page.
-    fn reply(&self, what: &'static str, work: impl FnOnce() -> Result<Outgoing, String> + Send + 'static) {
+    /// Answers from a thread that may block. Beyond the answers under way the newest request waits, and replaces the one that waited.
+    fn reply(&mut self, what: &'static str, work: impl FnOnce() -> Result<Outgoing, String> + Send + 'static) {
+        self.waiting = Some((what, Box::new(work)));
+        self.retry();
+    }
+
+    /// Begins the answer that waits, if there is a place.
+    fn retry(&mut self) {
+        if self.waiting.is_none() {
+            return;
+        }
         let Ok(place) = self.answers.clone().try_reserve_owned() else { return };
+        let Some((what, work)) = self.waiting.take() else { return };
         let Ok(permit) = self.service.answers.clone().try_acquire_owned() else {
             let why = "too many viewers ask at once; ask again";
             place.send(Outgoing::text(&ToViewer::Refused { what, why }));
             return;
         };
         tokio::task::spawn_blocking(move || {
-            let _permit = permit;
             let answer = work().unwrap_or_else(|why| Outgoing::text(&ToViewer::Refused { what, why: &why }));
             place.send(answer);
+            drop(permit);
         });
     }
 }
@@ -168,6 +190,7 @@ struct Presence<'a> {
 impl<'a> Presence<'a> {
     fn new(board: &'a Board) -> Self {
         board.viewers.fetch_add(1, Ordering::Relaxed);
+        board.was_watched.store(true, Ordering::Relaxed);
         Self { board, is_ready: false, is_watching: false }
     }
 

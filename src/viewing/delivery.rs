@@ -2,11 +2,18 @@
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::time::Duration;
 
 use super::board::{Board, Frames};
 use super::packing::{PackedMap, Part, PartId};
 use super::protocol::{ChunkHeader, KeyframeView, MOST_TO_VIEWER, MapHeader, Outgoing, ToViewer};
 
+/// Bytes of a `map` message: at first, and at least. They follow the speed of the connection.
+const FIRST_BYTES: usize = 1 << 20;
+const LEAST_BYTES: usize = 64 << 10;
+/// A message that took less time is followed by a larger one, one that took more by a smaller one.
+const QUICK: Duration = Duration::from_millis(500);
+const SLOW: Duration = Duration::from_secs(5);
 /// Room for the header of a `map` message.
 const MOST_HEADER: usize = 256 << 10;
 /// A chunk's line in that header takes no more.
@@ -23,7 +30,7 @@ struct Held {
 }
 
 /// What one viewer has.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub struct Delivery {
     parts: BTreeMap<PartId, Held>,
     /// Width of the grid and words of a Gaussian that the parts are of.
@@ -33,17 +40,48 @@ pub struct Delivery {
     messages: u64,
     /// A `map` message that has not been acknowledged.
     in_flight: Option<u64>,
+    /// Bytes of the next `map` message.
+    bytes: usize,
     frames: Option<Arc<Frames>>,
     keyframes: BTreeMap<usize, KeyframeView>,
     loops: usize,
     path: Option<Arc<super::protocol::CameraPath>>,
-    statistics: Option<usize>,
+    statistics: usize,
     image: Option<u64>,
     /// Whether images of the newest frame are wanted.
     pub wants_images: bool,
 }
 
+impl Default for Delivery {
+    fn default() -> Self {
+        Self {
+            parts: BTreeMap::new(),
+            form: None,
+            complete: None,
+            messages: 0,
+            in_flight: None,
+            bytes: FIRST_BYTES,
+            frames: None,
+            keyframes: BTreeMap::new(),
+            loops: 0,
+            path: None,
+            statistics: 0,
+            image: None,
+            wants_images: false,
+        }
+    }
+}
+
 impl Delivery {
+    /// Fits the size of messages to the connection: a message took so long to be sent.
+    pub fn sent(&mut self, bytes: usize, time: Duration) {
+        if time > SLOW {
+            self.bytes = (self.bytes / 2).max(LEAST_BYTES);
+        } else if time < QUICK && 2 * bytes > self.bytes {
+            self.bytes = (2 * self.bytes).min(MOST_TO_VIEWER - MOST_HEADER);
+        }
+    }
+
     /// The viewer has taken a `map` message.
     pub fn taken(&mut self, revision: u64) {
         if self.in_flight == Some(revision) {
@@ -99,8 +137,8 @@ impl Delivery {
     fn statistics(&mut self, board: &Board) -> Option<Outgoing> {
         let history = board.statistics.load_full();
         let new = history.since(self.statistics);
-        self.statistics = Some(history.last);
-        (!new.is_empty()).then(|| Outgoing::text(&ToViewer::Statistics { entries: new }))
+        self.statistics = history.last;
+        (!new.is_empty()).then(|| Outgoing::text(&ToViewer::Statistics { entries: &new }))
     }
 
     fn image(&mut self, board: &Board) -> Option<Outgoing> {
@@ -155,11 +193,13 @@ impl Delivery {
         let mut parts: Vec<&Arc<Part>> = map.parts.iter().filter(differs).collect();
         parts.sort_by_key(|part| self.parts.get(&part.id).map_or(0, |held| held.sent));
         let all = parts.len();
-        let mut room = MOST_TO_VIEWER - MOST_HEADER;
+        let mut room = self.bytes;
         let mut lines = MOST_HEADER / CHUNK_HEADER / 2;
+        let mut is_first = true;
         let fits = |part: &&Arc<Part>| {
             let bytes = 4 * part.words.len();
-            let fits = bytes <= room && lines > 0;
+            let fits = (bytes <= room || std::mem::take(&mut is_first)) && lines > 0;
+            is_first = false;
             (room, lines) = (room.saturating_sub(bytes), lines.saturating_sub(1));
             fits
         };

@@ -292,11 +292,10 @@ impl Desk for FolderDesk {
     }
 
     fn render(&self, request: &RenderRequest) -> Result<Outgoing, String> {
-        let (pinhole, world_from_camera) = request.camera().ok_or("the camera is none")?;
+        let (pinhole, world_from_camera) = request.camera().ok_or("a picture has 16 to 1920 pixels along a side, and a pose")?;
         let camera = ViewCamera { pinhole, camera_from_world: world_from_camera.inverse() };
         let recorded = request.id.map(|id| self.recorded(id)).transpose()?.map(|(_, image)| image.color);
-        let same = recorded.filter(|image| image.dimensions() == (pinhole.width, pinhole.height));
-        pictures::rendered(&self.draw(&camera)?, request, same.as_ref())
+        pictures::rendered(&self.draw(&camera)?, request, recorded.as_ref())
     }
 
     fn control(&self, _: Command) {}

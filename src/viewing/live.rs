@@ -1,4 +1,4 @@
-//! A run as a board for viewers: a thread looks at its progress, and asks for what viewers would take.
+//! A run as a board for viewers: a thread reads its progress, and requests what viewers would take.
 
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, mpsc};
@@ -44,6 +44,10 @@ struct LiveDesk {
 }
 
 const PHASES: [Phase; 4] = [Phase::Tracking, Phase::Refining, Phase::Measuring, Phase::Done];
+/// Places among these.
+const REFINING: usize = 1;
+const MEASURING: usize = 2;
+const DONE: usize = 3;
 
 impl Live {
     /// Begins to show a run of this recording.
@@ -70,19 +74,24 @@ impl Live {
         self.desk.clone()
     }
 
-    /// The refinement goes on after the run's end.
+    /// Shows that the refinement goes on after the run's end.
     pub fn refining(&self) {
-        self.desk.phase.store(1, Ordering::Relaxed);
+        self.desk.phase.store(REFINING, Ordering::Relaxed);
     }
 
-    /// The map is finished and is being measured.
+    /// Shows that the map is finished and is being measured.
     pub fn measuring(&self) {
-        self.desk.phase.store(2, Ordering::Relaxed);
+        self.desk.phase.store(MEASURING, Ordering::Relaxed);
     }
 
-    /// All results are written.
+    /// Shows that all results are written.
     pub fn done(&self) {
-        self.desk.phase.store(3, Ordering::Relaxed);
+        self.desk.phase.store(DONE, Ordering::Relaxed);
+    }
+
+    /// Whether anybody has ever looked.
+    pub fn was_watched(&self) -> bool {
+        self.board.was_watched.load(Ordering::Relaxed)
     }
 
     /// Viewers connected.
@@ -101,9 +110,9 @@ impl Drop for Live {
 }
 
 fn hello(recording: &Recording) -> Hello {
-    let (sequence, config) = (recording.sequence(), recording.config());
+    let sequence = recording.sequence();
     let sensor = sequence.sensor.kind();
-    let metric = sensor != SensorKind::Mono || config.replay.known_poses;
+    let metric = sensor != SensorKind::Mono;
     Hello {
         protocol: PROTOCOL,
         name: sequence.name.clone(),
@@ -238,7 +247,7 @@ impl Observer {
         shown.is_ok()
     }
 
-    /// A newer map is asked for once a viewer has all of the last one.
+    /// Requests a newer map once a viewer has all of the last one.
     fn see_map(&mut self) -> bool {
         let (board, snapshots) = (&self.desk.board, self.desk.progress.snapshots());
         if !board.wants_map() {
@@ -290,10 +299,12 @@ impl Desk for LiveDesk {
     }
 
     fn render(&self, request: &RenderRequest) -> Result<Outgoing, String> {
-        let (pinhole, world_from_camera) = request.camera().ok_or("the camera is none")?;
+        let (pinhole, world_from_camera) = request.camera().ok_or("a picture has 16 to 1920 pixels along a side, and a pose")?;
         let camera = ViewCamera { pinhole, camera_from_world: world_from_camera.inverse() };
         let recorded = request.id.map(|id| self.recorded(id)).transpose()?.map(|(_, image)| image.color);
-        let same = recorded.filter(|image| image.dimensions() == (pinhole.width, pinhole.height));
+        if self.phase.load(Ordering::Relaxed) == MEASURING {
+            return Err("the map is being measured; ask again when that is done".into());
+        }
         let (send, receive) = mpsc::channel();
         let reply = Box::new(move |view| {
             let _ = send.send(view);
@@ -302,7 +313,7 @@ impl Desk for LiveDesk {
             return Err("the mapper has too many pictures to render; ask again".into());
         }
         let view = receive.recv_timeout(RENDER_TIME).map_err(|_| "the mapper did not render it in time")??;
-        pictures::rendered(&view, request, same.as_ref())
+        pictures::rendered(&view, request, recorded.as_ref())
     }
 
     fn control(&self, command: Command) {
@@ -311,9 +322,7 @@ impl Desk for LiveDesk {
             Command::Pause => control.pause(),
             Command::Go => control.resume(),
             Command::Step => control.step(),
-            Command::Finish => {
-                control.stop();
-            }
+            Command::Finish => control.stop(),
             Command::Refine => control.refine_on(true),
         }
     }

@@ -8,7 +8,7 @@ use glam::{Quat, Vec3};
 use crate::splat::{GaussianCloud, ShDegree, opacity_from_raw};
 
 /// Most Gaussians of a part of a chunk.
-pub const MOST_IN_PART: usize = 16_384;
+pub const MOST_IN_PART: usize = 4096;
 /// A grid has at most this many occupied cells,
 const MOST_CELLS: usize = 64;
 /// and is kept while it has at least this many, or so many that an update stays small.

@@ -51,7 +51,7 @@ pub struct Embedded {
 pub fn standalone(name: &str) -> String {
     let title = name.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;");
     let script = script();
-    let parts = [("<!--TITLE-->", title.as_str()), ("<!--MESSAGES-->", ""), ("/*STYLE*/", STYLE), ("/*SCRIPT*/", &script)];
+    let parts = [("<!--MESSAGES-->", ""), ("/*STYLE*/", STYLE), ("/*SCRIPT*/", &script), ("<!--TITLE-->", title.as_str())];
     parts.iter().fold(PAGE.to_owned(), |page, (place, text)| page.replacen(place, text, 1))
 }
 

@@ -1,5 +1,6 @@
 //! Pictures for viewers: recorded images, and the map as the rasterizer draws it, its depth, and its error against a recorded image.
 
+use std::borrow::Cow;
 use std::io::Cursor;
 use std::sync::Mutex;
 
@@ -89,11 +90,15 @@ pub fn current(image: &RgbImage, frame: usize) -> Result<Outgoing, String> {
     message(header, jpeg(&small, CURRENT_QUALITY))
 }
 
-/// The message of a rendered view. An error needs the recorded image that it is against, of the same camera.
+/// The message of a rendered view. An error needs the recorded image that it is against, of the same field of view.
 ///
 /// # Errors
 /// Why there is no such picture.
 pub fn rendered(view: &Rendered, request: &RenderRequest, recorded: Option<&RgbImage>) -> Result<Outgoing, String> {
+    let recorded = recorded.map(|image| match image.dimensions() == (view.width, view.height) {
+        true => Cow::Borrowed(image),
+        false => Cow::Owned(imageops::resize(image, view.width, view.height, imageops::FilterType::Triangle)),
+    });
     let mut header = ImageHeader {
         of: "render",
         format: "png",
@@ -121,7 +126,7 @@ pub fn rendered(view: &Rendered, request: &RenderRequest, recorded: Option<&RgbI
             png(gray.as_raw(), gray.dimensions(), ExtendedColorType::L8)
         }
         RenderKind::Error => {
-            let (color, psnr_db) = error(view, recorded.ok_or("an error needs a keyframe, with its image and its camera")?);
+            let (color, psnr_db) = error(view, recorded.as_deref().ok_or("an error needs a keyframe with its image")?);
             header.psnr_db = psnr_db;
             header.format = "jpeg";
             jpeg(&color, JPEG_QUALITY)

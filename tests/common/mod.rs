@@ -5,6 +5,7 @@ pub mod browser;
 pub mod pairs;
 pub mod recording;
 pub mod requirements;
+pub mod viewer;
 
 use fastrand::Rng;
 use glam::{Quat, Vec3};

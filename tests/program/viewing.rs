@@ -1,11 +1,9 @@
 //! The view of a run as its viewers have it: polite ones, hostile ones, and a browser.
 
-use std::collections::BTreeMap;
-use std::io::{BufRead, BufReader, Read, Write};
-use std::net::{SocketAddr, TcpStream};
+use std::io::Write;
+use std::net::TcpStream;
 use std::path::Path;
-use std::process::Child;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use keysplat::export::MapFormat;
 use keysplat::geometry::Trajectory;
@@ -14,7 +12,7 @@ use keysplat::render::{GpuCloud, Rasterizer};
 use keysplat::splat::ViewCamera;
 use keysplat::viewing::PackedMap;
 use keysplat::{Config, Recording};
-use serde_json::{Value, json};
+use serde_json::json;
 use tungstenite::stream::MaybeTlsStream;
 use tungstenite::{Message, WebSocket};
 
@@ -22,183 +20,7 @@ use crate::common::browser::{Page, chromium};
 use crate::common::recording::{
     FRAMES, finish, finish_child, keysplat, metrics, recording, run_command, scratch, skipped_without_adapter,
 };
-
-const HANGS_AFTER: Duration = Duration::from_secs(90);
-/// Words of a Gaussian but for the harmonics, whose scale is that of their part.
-const BASE_WORDS: usize = 8;
-
-/// A program that serves a view.
-struct Serving {
-    child: Child,
-    said: String,
-    address: SocketAddr,
-    url: String,
-}
-
-impl Serving {
-    fn start(mut command: std::process::Command) -> Self {
-        let mut child = command.spawn().unwrap();
-        let mut stdout = BufReader::new(child.stdout.take().unwrap());
-        let mut line = String::new();
-        stdout.read_line(&mut line).unwrap();
-        let url = line.trim().strip_prefix("The view is at ").unwrap_or_else(|| panic!("no address: {line}")).to_owned();
-        let address = url.strip_prefix("http://").unwrap().split('/').next().unwrap().parse().unwrap();
-        // The table that follows is not read here, and is shorter than the pipe.
-        std::mem::forget(stdout);
-        Self { child, said: line, address, url }
-    }
-
-    /// `keysplat view` of a finished run.
-    fn view(path: &Path) -> Self {
-        let mut command = keysplat(["view", "--at", "127.0.0.1:0"]);
-        command.arg(path);
-        Self::start(command)
-    }
-
-    fn token(&self) -> &str {
-        self.url.split("token=").nth(1).unwrap()
-    }
-
-    /// The status line and the rest of an answer to a request that is written as it is.
-    fn ask(&self, request: &str) -> String {
-        let mut stream = TcpStream::connect(self.address).unwrap();
-        stream.set_read_timeout(Some(HANGS_AFTER)).unwrap();
-        stream.write_all(request.replace("HOST", &self.address.to_string()).as_bytes()).unwrap();
-        let mut answer = Vec::new();
-        let _ = stream.read_to_end(&mut answer);
-        String::from_utf8_lossy(&answer).into_owned()
-    }
-}
-
-impl Drop for Serving {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
-}
-
-/// A viewer that takes what it gets.
-struct Viewer {
-    socket: WebSocket<MaybeTlsStream<TcpStream>>,
-    parts: BTreeMap<(Vec<i64>, u64), Vec<u32>>,
-    updates: usize,
-    keyframes: BTreeMap<u64, Value>,
-    statistics: Vec<Value>,
-    images: Vec<Value>,
-    complete: bool,
-}
-
-impl std::fmt::Debug for Viewer {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let last = self.statistics.last();
-        write!(f, "{} updates, {} Gaussians, complete {}, {last:?}", self.updates, self.gaussians(), self.complete)
-    }
-}
-
-fn open(serving: &Serving) -> WebSocket<MaybeTlsStream<TcpStream>> {
-    let address = serving.url.replace("http:", "ws:").replace("/?", "/live?");
-    let (socket, _) = tungstenite::connect(&address).unwrap();
-    if let MaybeTlsStream::Plain(stream) = socket.get_ref() {
-        stream.set_read_timeout(Some(HANGS_AFTER)).unwrap();
-    }
-    socket
-}
-
-impl Viewer {
-    fn new(serving: &Serving) -> Self {
-        let mut viewer = Self {
-            socket: open(serving),
-            parts: BTreeMap::new(),
-            updates: 0,
-            keyframes: BTreeMap::new(),
-            statistics: Vec::new(),
-            images: Vec::new(),
-            complete: false,
-        };
-        let hello = viewer.take();
-        assert_eq!((hello["type"].as_str(), hello["protocol"].as_u64()), (Some("hello"), Some(1)), "{hello}");
-        viewer
-    }
-
-    fn send(&mut self, message: &Value) {
-        self.socket.send(Message::text(message.to_string())).unwrap();
-    }
-
-    /// Takes in one message and returns its object.
-    fn take(&mut self) -> Value {
-        let started = Instant::now();
-        let (value, payload) = loop {
-            assert!(started.elapsed() < HANGS_AFTER, "nothing but pings: {self:?}");
-            match self.socket.read().unwrap() {
-                Message::Text(text) => break (serde_json::from_str::<Value>(&text).unwrap(), Vec::new()),
-                Message::Binary(bytes) => {
-                    let header = u32::from_le_bytes(bytes[..4].try_into().unwrap()) as usize;
-                    assert!(bytes.len() <= 4 << 20 && header.is_multiple_of(4));
-                    break (serde_json::from_slice(&bytes[4..4 + header]).unwrap(), bytes[4 + header..].to_vec());
-                }
-                _ => {}
-            }
-        };
-        match value["type"].as_str().unwrap() {
-            "map" => self.take_map(&value, &payload),
-            "statistics" => self.statistics.extend(value["entries"].as_array().unwrap().iter().cloned()),
-            "image" => {
-                image::load_from_memory(&payload).unwrap();
-                self.images.push(value.clone());
-            }
-            "poses" => {
-                if value["all"] == true {
-                    self.keyframes.clear();
-                }
-                let keyframes = value["keyframes"].as_array().unwrap();
-                self.keyframes.extend(keyframes.iter().map(|k| (k["id"].as_u64().unwrap(), k.clone())));
-            }
-            _ => {}
-        }
-        value
-    }
-
-    fn take_map(&mut self, header: &Value, payload: &[u8]) {
-        self.updates += 1;
-        if header["reset"] == true {
-            self.parts.clear();
-        }
-        let words_each = BASE_WORDS + 4 * header["sh_degree"].as_u64().unwrap() as usize;
-        let mut words = payload.chunks_exact(4).map(|word| u32::from_le_bytes(word.try_into().unwrap()));
-        for chunk in header["chunks"].as_array().unwrap() {
-            let at = chunk["at"].as_array().unwrap().iter().map(|c| c.as_i64().unwrap()).collect();
-            let key = (at, chunk["part"].as_u64().unwrap());
-            let count = chunk["count"].as_u64().unwrap() as usize;
-            let taken: Vec<u32> = words.by_ref().take(count * words_each).collect();
-            assert_eq!(taken.len(), count * words_each);
-            let base = taken.chunks(words_each).flat_map(|gaussian| gaussian[..BASE_WORDS].to_vec()).collect();
-            if count == 0 { drop(self.parts.remove(&key)) } else { drop(self.parts.insert(key, base)) }
-        }
-        assert!(words.next().is_none());
-        self.complete = header["complete"] == true;
-        if self.complete {
-            assert_eq!(self.gaussians() as u64, header["gaussians"].as_u64().unwrap());
-        }
-        self.send(&json!({ "type": "taken", "revision": header["revision"] }));
-    }
-
-    fn gaussians(&self) -> usize {
-        self.parts.values().map(|words| words.len() / BASE_WORDS).sum()
-    }
-
-    /// Takes messages until a condition holds.
-    fn until(&mut self, what: &str, holds: impl Fn(&Self) -> bool) {
-        let started = Instant::now();
-        while !holds(self) {
-            self.take();
-            assert!(started.elapsed() < HANGS_AFTER, "{what} never came; {self:?}");
-        }
-    }
-
-    fn is_done(&self) -> bool {
-        self.statistics.last().is_some_and(|entry| entry["phase"] == "done")
-    }
-}
+use crate::common::viewer::{BASE_WORDS, Serving, Viewer, open};
 
 /// Sum of the base words of a map's Gaussians.
 fn sum<'a>(words: impl Iterator<Item = &'a u32>) -> u32 {
@@ -210,6 +32,11 @@ fn sum_of_file(path: &Path) -> (usize, u32) {
     let stride = BASE_WORDS + 4 * usize::from(packed.sh_degree.get());
     let base = packed.parts.iter().flat_map(|part| part.words.chunks(stride).flat_map(|gaussian| &gaussian[..BASE_WORDS]));
     (packed.gaussians, sum(base))
+}
+
+/// Optimisation steps so far.
+fn steps(viewer: &Viewer) -> u64 {
+    viewer.statistics.last().map_or(0, |entry| entry["steps"].as_u64().unwrap())
 }
 
 /// Random bytes, damaged messages and frames that are too large, in turn; a connection that was closed is opened again.
@@ -271,18 +98,27 @@ fn viewers_see_the_map_grow_and_change_nothing() {
     let many: Vec<TcpStream> = (0..200).filter_map(|_| TcpStream::connect(serving.address).ok()).collect();
     drop(many);
     torment(&serving, 10_000);
-    for step in ["step", "step", "go"] {
-        viewer.send(&json!({ "type": "control", "do": step }));
-        std::thread::sleep(Duration::from_millis(300));
+    let held = viewer.statistics.last().unwrap()["frames"].clone();
+    std::thread::sleep(Duration::from_millis(1500));
+    let seen_then = viewer.statistics.len();
+    viewer.until("more statistics", |viewer| viewer.statistics.len() > seen_then + 1);
+    assert_eq!(viewer.statistics.last().unwrap()["frames"], held, "a pause holds the frames");
+    let paused = steps(&viewer);
+    for _ in 0..2 {
+        // A step maps one keyframe, or takes one round, and pauses again.
+        let before = steps(&viewer);
+        viewer.send(&json!({ "type": "control", "do": "step" }));
+        viewer.until("the step", |viewer| steps(viewer) > before && viewer.statistics.last().unwrap()["paused"] == true);
     }
-    let (p, q) = ([0.0; 3], [0.0, 0.0, 0.0, 1.0]);
+    assert!(paused < steps(&viewer));
+    viewer.send(&json!({ "type": "control", "do": "go" }));
+    // From close by: more intersections than the mapper has room for.
+    let (p, q) = ([0.0, 0.0, 1.0], [0.0, 0.0, 0.0, 1.0]);
     viewer.send(&json!({ "type": "render", "request": 9, "kind": "depth", "p": p, "q": q,
-        "width": 200, "height": 150, "fx": 150, "fy": 150, "cx": 99.5, "cy": 74.5 }));
+        "width": 1920, "height": 1440, "fx": 1500, "fy": 1500, "cx": 959.5, "cy": 719.5 }));
     viewer.until("the end", |viewer| viewer.is_done() && viewer.complete);
-    let settled = Instant::now();
-    let (gaussians, expected) = sum_of_file(&seen.join("map.ply"));
-    viewer.until("the last map", |viewer| viewer.gaussians() == gaussians || settled.elapsed() > HANGS_AFTER);
-    viewer.until("the last map's values", |viewer| sum(viewer.parts.values().flatten()) == expected);
+    let (_, expected) = sum_of_file(&seen.join("map.ply"));
+    viewer.until("the last map", |viewer| viewer.complete && sum(viewer.parts.values().flatten()) == expected);
     assert!(viewer.updates >= 3, "{} updates", viewer.updates);
     assert_eq!(viewer.keyframes.len() as u64, metrics(&seen).keyframes.unwrap());
     assert!(viewer.images.iter().any(|image| image["of"] == "render" && image["kind"] == "depth"), "{:?}", viewer.images);
@@ -299,7 +135,6 @@ fn viewers_see_the_map_grow_and_change_nothing() {
 
 /// Goes on with the refinement of a run that is over, and ends it again: the files are those of the longer refinement.
 fn refine_after_the_end(viewer: &mut Viewer, out: &Path) {
-    let steps = |viewer: &Viewer| viewer.statistics.last().unwrap()["steps"].as_u64().unwrap();
     let (before, earlier) = (steps(viewer), metrics(out).map_hash);
     viewer.send(&json!({ "type": "control", "do": "refine" }));
     viewer.until("more steps", |viewer| steps(viewer) > before && !viewer.is_done());

@@ -11,11 +11,11 @@ pub trait Interlude {
     ///
     /// # Errors
     /// [`MappingError`] if the device fails.
-    fn between(&self, mapper: &mut Mapper) -> Result<ControlFlow<()>, MappingError>;
+    fn between(&self, mapper: &Mapper) -> Result<ControlFlow<()>, MappingError>;
 }
 
 impl<Stop: Fn() -> bool> Interlude for Stop {
-    fn between(&self, _: &mut Mapper) -> Result<ControlFlow<()>, MappingError> {
+    fn between(&self, _: &Mapper) -> Result<ControlFlow<()>, MappingError> {
         Ok(if self() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) })
     }
 }
