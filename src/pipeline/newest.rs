@@ -24,7 +24,7 @@ impl<T> Newest<T> {
         self.value.load_full()
     }
 
-    /// Asks for a newer value.
+    /// Requests a newer value.
     pub fn want(&self) {
         self.wanted.store(true, Ordering::Relaxed);
     }
@@ -34,7 +34,7 @@ impl<T> Newest<T> {
         self.wanted.load(Ordering::Relaxed)
     }
 
-    /// Replaces the value; the next one has to be asked for again.
+    /// Replaces the value; the next one has to be requested again.
     pub fn put(&self, value: T) {
         self.wanted.store(false, Ordering::Relaxed);
         self.value.store(Some(Arc::new(value)));

@@ -1,4 +1,4 @@
-//! One viewer's connection: sends what is new when there is room, and answers what is asked.
+//! One viewer's connection: sends what is new when there is room, and answers requests.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};

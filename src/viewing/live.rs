@@ -270,17 +270,14 @@ impl Observer {
 }
 
 fn frames(poses: Option<&KeyframePoses>) -> Frames {
-    let view = |k: &crate::tracking::KeyframePose| KeyframeView {
+    let Some(poses) = poses else { return Frames::default() };
+    let views = poses.keyframes.iter().map(|k| KeyframeView {
         id: k.id,
         frame: k.frame_index,
         t: k.timestamp_s,
         pose: (&k.world_from_camera).into(),
-    };
-    poses.map_or_else(Frames::default, |poses| Frames {
-        keyframes: poses.keyframes.iter().map(view).collect(),
-        loops: poses.loops.clone(),
-        current: None,
-    })
+    });
+    Frames { keyframes: views.collect(), loops: poses.loops.clone(), current: None }
 }
 
 impl LiveDesk {

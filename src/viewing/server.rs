@@ -46,13 +46,13 @@ pub trait Desk: Send + Sync {
     /// The recorded image of a keyframe.
     ///
     /// # Errors
-    /// What the viewer is told, where there is none.
+    /// Why there is none, for the viewer.
     fn keyframe(&self, id: usize) -> Result<Outgoing, String>;
 
     /// A picture of the map.
     ///
     /// # Errors
-    /// What the viewer is told, where there is none.
+    /// Why there is none, for the viewer.
     fn render(&self, request: &RenderRequest) -> Result<Outgoing, String>;
 
     /// Does what a viewer with control wants.
