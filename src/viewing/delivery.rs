@@ -214,3 +214,7 @@ impl Delivery {
         self.parts.keys().filter(|id| !has(id)).take(MOST_HEADER / CHUNK_HEADER / 2).copied().collect()
     }
 }
+
+#[cfg(test)]
+#[path = "delivery_tests.rs"]
+mod tests;

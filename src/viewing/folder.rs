@@ -1,6 +1,7 @@
 //! A finished run's folder, or a map alone, as a board for viewers.
 
-use std::path::{Path, PathBuf};
+use std::collections::BTreeMap;
+use std::path::Path;
 use std::sync::{Arc, Mutex};
 
 use nalgebra::{Point3, Vector3};
@@ -8,6 +9,7 @@ use serde::de::DeserializeOwned;
 
 use super::board::{Board, Frames, History as Figures, put};
 use super::delivery::Delivery;
+use super::error::ViewError;
 use super::packing::PackedMap;
 use super::pictures::{self, RecordedImages};
 use super::protocol::{
@@ -16,9 +18,10 @@ use super::protocol::{
 use super::server::Desk;
 use crate::config::{Config, ConfigError};
 use crate::evaluation::{Comparison, MAX_TIME_DIFFERENCE_S, Metrics};
-use crate::export::{ExportError, MapFormat};
-use crate::geometry::{Trajectory, TrajectoryError, align};
+use crate::export::MapFormat;
+use crate::geometry::{Trajectory, align};
 use crate::gpu::{Gpu, GpuError};
+use crate::mapping::KeyframeReport;
 use crate::recording::Recording;
 use crate::render::{GpuCloud, Rasterizer, Rendered};
 use crate::run_folder::{History, outputs};
@@ -29,23 +32,6 @@ use crate::splat::{GaussianCloud, ViewCamera};
 const REVISION: u64 = 1;
 /// Poses of a path; longer ones are thinned.
 const MOST_POSES: usize = 20_000;
-
-/// Files that cannot be shown.
-#[derive(Debug, thiserror::Error)]
-pub enum ViewError {
-    /// Neither a run's folder nor a map.
-    #[error("{path} is no folder of a run and no map; give a folder that keysplat run wrote, or a map like map.ply")]
-    Nothing {
-        /// The path.
-        path: PathBuf,
-    },
-    /// The map cannot be read.
-    #[error(transparent)]
-    Map(#[from] ExportError),
-    /// A trajectory cannot be read.
-    #[error(transparent)]
-    Trajectory(#[from] TrajectoryError),
-}
 
 /// Files of a run, or a map alone, opened for viewing.
 pub struct Finished {
@@ -230,25 +216,35 @@ impl Files {
         Some(truth.map(|point| map_from_truth.act(&Point3::from(*point)).coords.into()).collect())
     }
 
+    /// How the run went, keyframe by keyframe.
     fn statistics(&self) -> Figures {
         let mut figures = Figures::default();
         let Some(history) = &self.history else { return figures };
-        let frames = self.metrics.as_ref().map_or(0, |metrics| metrics.frames_tracked as usize);
         let mut steps = 0;
+        let frame_of: BTreeMap<usize, usize> = self.keyframe_views().iter().map(|view| (view.id, view.frame)).collect();
         for (k, record) in history.keyframes.iter().enumerate() {
-            steps += record.report.iterations;
-            let is_last = k + 1 == history.keyframes.len();
+            let KeyframeReport { iterations, gaussians, psnr_db, .. } = record.report;
+            steps += iterations;
+            let frame = frame_of.get(&k).copied().unwrap_or(k);
+            let tracked =
+                history.frames.binary_search_by_key(&frame, |tracked| tracked.frame).map(|place| &history.frames[place]);
             figures.push(Statistics {
                 s: record.done_s,
-                phase: if is_last { Phase::Done } else { Phase::Tracking },
-                frames: if is_last { frames } else { frames * (k + 1) / history.keyframes.len() },
+                frames: frame + 1,
                 keyframes: k + 1,
-                gaussians: if is_last { self.cloud.len() } else { record.report.gaussians },
+                gaussians,
                 steps,
-                psnr_db: (record.report.iterations > 0).then_some(record.report.psnr_db),
+                psnr_db: (iterations > 0).then_some(psnr_db),
+                frame_ms: tracked.ok().map(|tracked| tracked.times.total_ms()),
+                step_ms: (iterations > 0).then(|| 1e3 * record.busy_s / iterations as f64),
                 host_bytes: record.host_bytes,
                 ..Statistics::default()
             });
+        }
+        if let Some((metrics, last)) = self.metrics.as_ref().zip(figures.newest().copied()) {
+            let steps = metrics.mapping.as_ref().map_or(last.steps, |mapping| mapping.iterations as usize);
+            let (s, frames) = (metrics.wall_s.unwrap_or(last.s).max(last.s), metrics.frames as usize);
+            figures.push(Statistics { s, phase: Phase::Done, frames, gaussians: self.cloud.len(), steps, ..last });
         }
         figures
     }

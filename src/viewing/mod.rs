@@ -6,6 +6,7 @@
 mod board;
 mod connection;
 mod delivery;
+mod error;
 mod folder;
 mod live;
 mod packing;
@@ -16,9 +17,10 @@ mod server;
 
 pub use board::{Board, Frames, History};
 pub use delivery::Delivery;
-pub use folder::{Finished, ViewError};
+pub use error::ViewError;
+pub use folder::Finished;
 pub use live::Live;
 pub use packing::{PackedMap, Part, PartId};
 pub use page::{Embedded, embedded};
 pub use protocol::{FromViewer, Hello, Outgoing, RenderRequest};
-pub use server::{DEFAULT_ADDRESS, Desk, Server, ServerError, ServerOptions};
+pub use server::{DEFAULT_ADDRESS, Desk, Server, ServerOptions};

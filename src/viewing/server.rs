@@ -21,6 +21,7 @@ use tokio::sync::{Semaphore, oneshot};
 use tokio::time::timeout;
 
 use super::board::Board;
+use super::error::ViewError;
 use super::protocol::{Command, MOST_FROM_VIEWER, Outgoing, RenderRequest};
 use super::{connection, page};
 
@@ -68,22 +69,6 @@ pub struct ServerOptions {
     pub remote_control: bool,
 }
 
-/// A view that cannot be served.
-#[derive(Debug, thiserror::Error)]
-pub enum ServerError {
-    /// The address cannot be listened at.
-    #[error("cannot show the run at {address}: {source}; choose another address or port, like --view=127.0.0.1:7008")]
-    Listen {
-        /// The address.
-        address: SocketAddr,
-        /// The cause.
-        source: io::Error,
-    },
-    /// The system gives no thread or no randomness.
-    #[error("cannot start the server of the view: {0}")]
-    Start(io::Error),
-}
-
 /// A running server; it ends when this is dropped.
 #[derive(Debug)]
 pub struct Server {
@@ -114,11 +99,11 @@ impl Server {
     /// Serves a board.
     ///
     /// # Errors
-    /// [`ServerError`] if the address is taken, or the system gives no thread.
-    pub fn start(options: ServerOptions, board: Arc<Board>, desk: Arc<dyn Desk>) -> Result<Self, ServerError> {
+    /// [`ViewError`] if the address is taken, or the system gives no thread.
+    pub fn start(options: ServerOptions, board: Arc<Board>, desk: Arc<dyn Desk>) -> Result<Self, ViewError> {
         let listener = listen(options.address)?;
-        let address = listener.local_addr().map_err(ServerError::Start)?;
-        let token = token().map_err(ServerError::Start)?;
+        let address = listener.local_addr().map_err(ViewError::Start)?;
+        let token = token().map_err(ViewError::Start)?;
         let service = Service {
             page: page::standalone(&board.hello.name),
             token: token.clone(),
@@ -132,7 +117,7 @@ impl Server {
             .enable_all()
             .max_blocking_threads(BLOCKING_THREADS)
             .build()
-            .map_err(ServerError::Start)?;
+            .map_err(ViewError::Start)?;
         let (stop, stopped) = oneshot::channel();
         let thread = std::thread::Builder::new().name("viewing".into()).spawn(move || {
             runtime.block_on(async {
@@ -143,7 +128,7 @@ impl Server {
             });
             runtime.shutdown_background();
         });
-        Ok(Self { address, token, stop: Some(stop), thread: Some(thread.map_err(ServerError::Start)?) })
+        Ok(Self { address, token, stop: Some(stop), thread: Some(thread.map_err(ViewError::Start)?) })
     }
 
     /// The address that it listens at.
@@ -171,10 +156,10 @@ impl Drop for Server {
     }
 }
 
-fn listen(address: Option<SocketAddr>) -> Result<std::net::TcpListener, ServerError> {
+fn listen(address: Option<SocketAddr>) -> Result<std::net::TcpListener, ViewError> {
     let bind = |address: SocketAddr| {
-        let listener = std::net::TcpListener::bind(address).map_err(|source| ServerError::Listen { address, source })?;
-        listener.set_nonblocking(true).map_err(ServerError::Start)?;
+        let listener = std::net::TcpListener::bind(address).map_err(|source| ViewError::Listen { address, source })?;
+        listener.set_nonblocking(true).map_err(ViewError::Start)?;
         Ok(listener)
     };
     match address {

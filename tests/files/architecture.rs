@@ -56,6 +56,7 @@ const ALLOWED: [(&str, &[&str]); 25] = [
             "splat",
             "gpu",
             "render",
+            "mapping",
             "export",
             "evaluation",
             "config",

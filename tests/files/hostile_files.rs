@@ -11,6 +11,7 @@ use keysplat::export::MapFormat;
 use keysplat::geometry::Trajectory;
 use keysplat::sequence::Layout;
 use keysplat::synthetic::SceneConfig;
+use keysplat::viewing::FromViewer;
 
 /// Counts the bytes in use by each thread, and the most that ever were: a test is one thread, and others run beside it.
 struct Counting;
@@ -53,6 +54,10 @@ fn parse(target: &str, bytes: &[u8]) -> usize {
         (Some(layout), _) => layout.parse_files(bytes).iter().filter(|result| result.is_ok()).count(),
         (_, "trajectory") => usize::from(text().is_some_and(|text| Trajectory::parse_tum(text, path).is_ok())),
         (_, "config") => usize::from(text().is_some_and(|text| Config::parse(text, path, false).is_ok())),
+        (_, "viewer") => usize::from(text().is_some_and(|text| match FromViewer::parse(text) {
+            Some(FromViewer::Render(request)) => request.camera().is_some(),
+            message => message.is_some(),
+        })),
         (_, "scene") => usize::from(text().is_some_and(|text| SceneConfig::parse(text, path).is_ok())),
         _ => panic!("the corpus {target} has no parser here"),
     }

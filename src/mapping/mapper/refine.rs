@@ -3,6 +3,7 @@
 //! Online, some steps of the running epoch follow each keyframe, at constant rates. The final refinement follows the last keyframe: steps at
 //! half size first, then at full size, with density control in between; rates fall exponentially, as 3DGS has it for positions.
 
+use std::ops::ControlFlow;
 use std::time::Instant;
 
 use serde::{Deserialize, Serialize};
@@ -60,6 +61,14 @@ impl FinalRefinement {
 
     fn is_done(&self) -> bool {
         self.progress() >= 1.0 && self.more == 0
+    }
+
+    /// An interlude, whose time is none of the refinement's seconds.
+    fn interlude(&mut self, mapper: &Mapper, interlude: &dyn Interlude) -> Result<ControlFlow<()>, MappingError> {
+        let began = Instant::now();
+        let flow = interlude.between(mapper)?;
+        self.started = self.started.map(|started| started + began.elapsed());
+        Ok(flow)
     }
 
     /// Goes on beyond its end for so many steps, at the last rates and without density control.
@@ -146,7 +155,7 @@ impl Mapper {
     ) -> Result<Option<RefineReport>, MappingError> {
         let RefineConfig { steps, density_every, growth_share, half_size_share, .. } = refinement.config;
         let is_over = refinement.is_done() || self.cloud.is_empty() || self.keyframes.is_empty();
-        if is_over || interlude.between(self)?.is_break() {
+        if is_over || refinement.interlude(self, interlude)?.is_break() {
             return Ok(None);
         }
         let density = DensityConfig { views: refinement.config.density_views, ..self.config.density.clone() };
@@ -156,7 +165,7 @@ impl Mapper {
         let is_extra = refinement.progress() >= 1.0;
         let left = if is_extra { refinement.more } else { steps - refinement.done };
         let end = refinement.done + density_every.min(left);
-        while refinement.done < end && !refinement.is_done() && interlude.between(self)?.is_continue() {
+        while refinement.done < end && !refinement.is_done() && refinement.interlude(self, interlude)?.is_continue() {
             let coarse = refinement.progress() < half_size_share;
             let batch = self.draw(BATCH.min(end - refinement.done), coarse);
             adam = refinement.rates();

@@ -2,7 +2,7 @@
 
 const FIRST_PAUSE_MS = 500;
 const LONGEST_PAUSE_MS = 15000;
-// A peer that says nothing within this time after opening is as good as gone.
+// Without a hello within this time the peer is as good as gone.
 const HELLO_WITHIN_MS = 20000;
 
 function liveAddress() {
