@@ -4,22 +4,20 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::{Arc, Mutex};
 
-use nalgebra::{Point3, Vector3};
 use serde::de::DeserializeOwned;
 
 use super::board::{Board, Frames, History as Figures, put};
 use super::delivery::Delivery;
 use super::error::ViewError;
 use super::packing::PackedMap;
+use super::path::camera_path;
 use super::pictures::{self, RecordedImages};
-use super::protocol::{
-    CameraPath, CameraView, Command, Hello, KeyframeView, Outgoing, PROTOCOL, Phase, RenderRequest, Statistics, ToViewer,
-};
+use super::protocol::{CameraView, Command, Hello, KeyframeView, Outgoing, PROTOCOL, Phase, RenderRequest, Statistics, ToViewer};
 use super::server::Desk;
 use crate::config::{Config, ConfigError};
-use crate::evaluation::{Comparison, MAX_TIME_DIFFERENCE_S, Metrics};
+use crate::evaluation::{Comparison, Metrics};
 use crate::export::MapFormat;
-use crate::geometry::{Trajectory, align};
+use crate::geometry::Trajectory;
 use crate::gpu::{Gpu, GpuError};
 use crate::mapping::KeyframeReport;
 use crate::recording::Recording;
@@ -30,8 +28,6 @@ use crate::splat::{GaussianCloud, ViewCamera};
 
 /// The only one of files.
 const REVISION: u64 = 1;
-/// Poses of a path; longer ones are thinned.
-const MOST_POSES: usize = 20_000;
 
 /// Files of a run, or a map alone, opened for viewing.
 pub struct Finished {
@@ -82,7 +78,7 @@ impl Finished {
         put(&board.map, PackedMap::new(&files.cloud, REVISION, None));
         let loops = files.history.as_ref().map_or_else(Vec::new, |history| history.loops.clone());
         put(&board.frames, Frames { keyframes: keyframes.clone(), loops, current: None });
-        put(&board.path, files.path());
+        put(&board.path, camera_path(&files.trajectory, files.comparison.as_ref()));
         board.statistics.store(Arc::new(files.statistics()));
         let adapter = files.recording.as_ref().and_then(|r| r.config().adapter.clone());
         let Files { cloud, recording, .. } = files;
@@ -186,34 +182,6 @@ impl Files {
             pose: (&pose.world_from_camera).into(),
         };
         self.keyframes.poses.iter().enumerate().map(view).collect()
-    }
-
-    /// The camera's path in the map's world; errors and truth are brought there from the world of the truth.
-    fn path(&self) -> CameraPath {
-        let stride = self.trajectory.poses.len().div_ceil(MOST_POSES).max(1);
-        let compared = self.comparison.as_ref();
-        let error_at = |t: f64| {
-            let poses = &compared?.poses;
-            let place = poses.partition_point(|pose| pose.timestamp_s < t - MAX_TIME_DIFFERENCE_S);
-            poses.get(place).filter(|pose| (pose.timestamp_s - t).abs() <= MAX_TIME_DIFFERENCE_S)?.error_m
-        };
-        let pose = |pose: &crate::geometry::StampedPose| {
-            let [x, y, z] = pose.world_from_camera.translation.vector.into();
-            (pose.timestamp_s, x, y, z, error_at(pose.timestamp_s))
-        };
-        let poses = self.trajectory.poses.iter().step_by(stride).map(pose).collect();
-        CameraPath { poses, truth: self.truth().unwrap_or_default() }
-    }
-
-    fn truth(&self) -> Option<Vec<[f64; 3]>> {
-        let compared =
-            self.comparison.as_ref().filter(|c| !c.truth.is_empty() && c.poses.len() == self.trajectory.poses.len())?;
-        let from: Vec<Vector3<f64>> = compared.poses.iter().map(|pose| pose.position.into()).collect();
-        let to: Vec<Vector3<f64>> = self.trajectory.poses.iter().map(|pose| pose.world_from_camera.translation.vector).collect();
-        let map_from_truth = align(&from, &to, true)?;
-        let stride = compared.truth.len().div_ceil(MOST_POSES).max(1);
-        let truth = compared.truth.iter().step_by(stride);
-        Some(truth.map(|point| map_from_truth.act(&Point3::from(*point)).coords.into()).collect())
     }
 
     /// How the run went, keyframe by keyframe.

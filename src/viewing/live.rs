@@ -7,12 +7,14 @@ use std::time::{Duration, Instant};
 
 use super::board::{Board, Frames, NumberedImage, put};
 use super::packing::PackedMap;
+use super::path::camera_path;
 use super::pictures::{self, RecordedImages};
 use super::protocol::{
     CameraView, Command, CurrentView, Hello, KeyframeView, Outgoing, PROTOCOL, Phase, PoseView, RenderRequest, Statistics,
 };
 use super::server::Desk;
-use crate::evaluation::machine;
+use crate::evaluation::{Alignment, Comparison, evaluate_trajectory, machine};
+use crate::geometry::Trajectory;
 use crate::pipeline::{FrameImage, KeyframePoses, Outlook, Progress, RenderOrder};
 use crate::recording::Recording;
 use crate::sequence::{RectifiedImage, SensorKind};
@@ -21,6 +23,7 @@ use crate::splat::{MapSnapshot, ViewCamera};
 /// How often the thread looks.
 const LOOK_EVERY: Duration = Duration::from_millis(100);
 const STATISTICS_EVERY: Duration = Duration::from_secs(1);
+const PATH_EVERY: Duration = Duration::from_secs(2);
 const IMAGE_EVERY: Duration = Duration::from_millis(200);
 /// A viewer's picture has to be there after this time.
 const RENDER_TIME: Duration = Duration::from_secs(20);
@@ -136,6 +139,8 @@ struct Observer {
     image: Option<Arc<FrameImage>>,
     frame: usize,
     revision: u64,
+    path_of: Option<Arc<KeyframePoses>>,
+    compared: Instant,
     counted: Instant,
     pictured: Instant,
 }
@@ -152,6 +157,8 @@ impl Observer {
             image: None,
             frame: 0,
             revision: 0,
+            path_of: None,
+            compared: now,
             counted: now.checked_sub(STATISTICS_EVERY).unwrap_or(now),
             pictured: now,
         }
@@ -162,7 +169,7 @@ impl Observer {
             let is_watched = self.desk.board.viewers.load(Ordering::Relaxed) > 0;
             let mut changed = self.count();
             if is_watched {
-                changed |= self.see_frames() | self.see_image() | self.see_map();
+                changed |= self.see_frames() | self.see_path() | self.see_image() | self.see_map();
             }
             if changed {
                 self.desk.board.announce();
@@ -226,6 +233,24 @@ impl Observer {
         let frames = last.map_or_else(|| frames(poses.as_deref()), |last| (*last).clone());
         put(&self.desk.board.frames, Frames { current, ..frames });
         (self.frame, self.poses) = (frame, poses);
+        true
+    }
+
+    /// The path through the keyframes, beside the truth where the recording has one.
+    fn see_path(&mut self) -> bool {
+        let Some(poses) = self.poses.clone().filter(|_| self.compared.elapsed() >= PATH_EVERY) else { return false };
+        if self.path_of.as_ref().is_some_and(|last| Arc::ptr_eq(last, &poses)) {
+            return false;
+        }
+        self.compared = Instant::now();
+        let sequence = self.desk.recording.sequence();
+        let estimate = Trajectory { poses: poses.keyframes.iter().map(|keyframe| keyframe.stamped()).collect() };
+        let errors = sequence.groundtruth.as_ref().and_then(|truth| {
+            let errors = evaluate_trajectory(truth, &estimate, Alignment::of(sequence.sensor.kind())).ok()?;
+            Some(Comparison::of(&estimate, Some((truth, &errors))))
+        });
+        put(&self.desk.board.path, camera_path(&estimate, errors.as_ref()));
+        self.path_of = Some(poses);
         true
     }
 

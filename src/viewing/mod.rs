@@ -11,6 +11,7 @@ mod folder;
 mod live;
 mod packing;
 mod page;
+mod path;
 mod pictures;
 mod protocol;
 mod server;
