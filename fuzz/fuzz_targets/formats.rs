@@ -1,4 +1,5 @@
-//! Maps in all file formats. A map that was read is finite; written and read again it is the same file.
+//! Maps in all file formats. A map that was read is finite; written and read again it is the same file, where the
+//! format is lossless.
 #![no_main]
 
 use keysplat::export::MapFormat;
@@ -9,7 +10,9 @@ fuzz_target!(|bytes: &[u8]| {
         if let Ok(cloud) = format.decode(bytes) {
             let once = format.encode(&cloud).expect("a map that was read is finite");
             let again = format.decode(&once).expect("a map that was written is valid");
-            assert_eq!(format.encode(&again).expect("it is finite"), once);
+            if format.is_lossless() {
+                assert_eq!(format.encode(&again).expect("it is finite"), once);
+            }
         }
     }
 });

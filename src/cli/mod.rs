@@ -6,6 +6,7 @@ mod calibrate;
 mod check;
 mod demo;
 mod eval;
+mod export;
 mod generate;
 mod keys;
 mod progress;
@@ -62,6 +63,8 @@ enum Command {
     Generate(generate::GenerateArgs),
     /// Measure a finished run, of ours or anybody's.
     Eval(eval::EvalArgs),
+    /// Write a map in another file format, whole or in part.
+    Export(export::ExportArgs),
     /// Draw a finished run as one HTML file that needs nothing else.
     Report(report::ReportArgs),
     /// Render a moving picture of a finished run's map.
@@ -114,6 +117,7 @@ fn execute(command: Command, verbosity: Verbosity) -> miette::Result<()> {
         Command::Demo(args) => demo::demo(&args, verbosity),
         Command::Generate(args) => generate::generate(&args, verbosity),
         Command::Eval(args) => eval::eval(&args, verbosity),
+        Command::Export(args) => export::export(&args, verbosity),
         Command::Report(args) => report::report(&args, verbosity),
         Command::Render(args) => render::render(&args, verbosity),
         Command::View(args) => view::view(&args, verbosity),

@@ -17,6 +17,7 @@ pub(super) const FORMAT: FormatRow = FormatRow {
     name: "ply",
     extension: "ply",
     help: "PLY of the 3D Gaussian Splatting reference code, binary little endian; every viewer reads it.",
+    is_lossless: true,
     encode,
     decode,
 };

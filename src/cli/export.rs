@@ -1,0 +1,95 @@
+//! `keysplat export`: a map in another file format, whole or in part.
+
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use glam::Vec3;
+use keysplat::export::{ExportFilter, MapFormat};
+use keysplat::run_folder::outputs;
+use keysplat::splat::ShDegree;
+use miette::{IntoDiagnostic, miette};
+
+use super::{Verbosity, print};
+
+#[derive(Args)]
+pub struct ExportArgs {
+    /// Folder of a run, or a map.
+    map: PathBuf,
+    /// File to write; its ending is the format: .ply, .spz or .glb.
+    out: PathBuf,
+    /// Format, where the ending does not say it.
+    #[arg(long, value_enum)]
+    format: Option<MapFormat>,
+    /// Most Gaussians: those that cover most are kept.
+    #[arg(long)]
+    max_gaussians: Option<usize>,
+    /// Leave out Gaussians that are less opaque, e.g. 0.05.
+    #[arg(long, value_parser = parse_share)]
+    min_opacity: Option<f32>,
+    /// Highest degree of the spherical harmonics, 0 to 3.
+    #[arg(long, value_parser = parse_degree)]
+    sh_degree: Option<ShDegree>,
+    /// Keep the box between two corners, metres in the world of the map.
+    #[arg(long, value_name = "X,Y,Z:X,Y,Z", value_parser = parse_box, allow_hyphen_values = true)]
+    crop: Option<(Vec3, Vec3)>,
+}
+
+fn parse_share(text: &str) -> Result<f32, String> {
+    let share = text.parse().ok().filter(|share| (0.0..=1.0).contains(share));
+    share.ok_or_else(|| format!("`{text}` is no number from 0 to 1"))
+}
+
+fn parse_degree(text: &str) -> Result<ShDegree, String> {
+    text.parse().ok().and_then(ShDegree::new).ok_or_else(|| format!("`{text}` is no degree; write 0, 1, 2 or 3"))
+}
+
+fn parse_box(text: &str) -> Result<(Vec3, Vec3), String> {
+    let wrong = || format!("`{text}` is no box; write two corners, like -1,-1,0:1,1,3, the lower one first");
+    let corner = |text: &str| {
+        let numbers: Vec<f32> = text.split(',').map(|part| part.trim().parse().ok()).collect::<Option<_>>()?;
+        <[f32; 3]>::try_from(numbers).ok().map(Vec3::from).filter(|corner| corner.is_finite())
+    };
+    let (low, high) = text.split_once(':').ok_or_else(wrong)?;
+    let (low, high) = corner(low).zip(corner(high)).ok_or_else(wrong)?;
+    if low.cmple(high).all() { Ok((low, high)) } else { Err(wrong()) }
+}
+
+/// The map of a run's folder, or of a file.
+fn find(path: &Path) -> miette::Result<(PathBuf, MapFormat)> {
+    let found =
+        if path.is_dir() { outputs::find_map(path) } else { MapFormat::of_path(path).map(|format| (path.to_owned(), format)) };
+    let known = || MapFormat::all().iter().map(|format| format!(".{}", format.extension())).collect::<Vec<_>>().join(", ");
+    found.ok_or_else(|| miette!("{} is no map; give the folder of a run, or a file of {}", path.display(), known()))
+}
+
+pub fn export(args: &ExportArgs, verbosity: Verbosity) -> miette::Result<()> {
+    let (path, from) = find(&args.map)?;
+    let to = args.format.or_else(|| MapFormat::of_path(&args.out));
+    let to = to.ok_or_else(|| miette!("{} does not say its format; end it in .ply, .spz or .glb", args.out.display()))?;
+    let ExportArgs { max_gaussians, min_opacity, sh_degree, crop, .. } = *args;
+    let cloud = from.read(&path).into_diagnostic()?;
+    let part = ExportFilter { crop, min_opacity, max_gaussians, sh_degree }.apply(&cloud);
+    if part.is_empty() {
+        return Err(miette!("of {} Gaussians, none passes; widen --crop or lower --min-opacity", cloud.len()));
+    }
+    let bytes = to.write(&part, &args.out).into_diagnostic()?.len();
+    if verbosity.quiet {
+        return Ok(());
+    }
+    print(&format!("{}: {} Gaussians, {:.1} MiB\n", args.out.display(), part.len(), bytes as f64 / f64::from(1 << 20)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn boxes_have_two_corners() {
+        assert_eq!(parse_box("-1,-2,0:1, 2,3"), Ok((Vec3::new(-1.0, -2.0, 0.0), Vec3::new(1.0, 2.0, 3.0))));
+        for wrong in ["", "1,2,3", "1,2:3,4", "1,1,1:0,2,2", "nan,0,0:1,1,1", "0,0,0:1,1,inf"] {
+            assert!(parse_box(wrong).is_err(), "{wrong}");
+        }
+        assert!(parse_share("0.5").is_ok() && parse_share("1.5").is_err() && parse_share("nan").is_err());
+        assert!(parse_degree("2").is_ok() && parse_degree("4").is_err());
+    }
+}

@@ -1,0 +1,189 @@
+//! SPZ (Niantic, MIT), versions 2 and 3: one gzip stream of a header and the attributes, one after the other, in 8 to 24 bits each.
+//!
+//! Writes version 3, which most readers know. Left out: version 4 (zstd), and harmonics above degree 3.
+
+use std::io::{BufRead, Read, Write};
+use std::path::Path;
+
+use flate2::Compression;
+use flate2::bufread::MultiGzDecoder;
+use flate2::write::GzEncoder;
+use glam::{Quat, Vec3};
+
+use super::axes::turned;
+use super::{ExportError, FileSize, FormatRow};
+use crate::splat::{Gaussian, GaussianCloud, ShDegree, opacity_from_raw, raw_opacity_from_opacity};
+
+/// The format's row in the table of formats.
+pub(super) const FORMAT: FormatRow = FormatRow {
+    name: "spz",
+    extension: "spz",
+    help: "SPZ version 3: a tenth of the PLY's size, quantised; most web viewers read it.",
+    is_lossless: false,
+    encode,
+    decode,
+};
+
+const MAGIC: u32 = 0x5053_474e;
+const VERSION: u32 = 3;
+const HEADER: usize = 16;
+/// Positions are fixed-point numbers of 24 bits, of which usually so many are behind the point.
+const FRACTIONAL_BITS: i32 = 12;
+/// More where Gaussians are small: a step is at most this share of the median of their least extents.
+const STEP: f32 = 1.0 / 8.0;
+const POSITION_BITS: i32 = 24;
+/// A colour's byte per unit of the constant harmonic.
+const COLOR_SCALE: f32 = 0.15;
+/// Bytes are `(log scale + 10) · 16`.
+const LOG_SCALE: (f32, f32) = (10.0, 16.0);
+/// A compressed byte stands for no more than this.
+const MOST_INFLATION: u64 = 1032;
+/// Opacities of the bytes 0 and 255, whose logits would not be finite.
+const OPACITIES: (f32, f32) = (1.0 / 1024.0, 1.0 - 1.0 / 1024.0);
+
+/// Bytes of a Gaussian in a version.
+fn stride(version: u32, degree: ShDegree) -> usize {
+    let rotation = if version >= 3 { 4 } else { 3 };
+    9 + 1 + 3 + 3 + rotation + 3 * (degree.coefficients() - 1)
+}
+
+fn encode(cloud: &GaussianCloud) -> Result<Vec<u8>, ExportError> {
+    if let Some(index) = cloud.first_non_finite() {
+        return Err(ExportError::NonFinite { index });
+    }
+    let cloud = turned(cloud);
+    let bits = fractional_bits(&cloud);
+    let coefficients = cloud.sh_degree.coefficients();
+    let mut bytes = Vec::with_capacity(HEADER + cloud.len() * stride(VERSION, cloud.sh_degree));
+    bytes.extend(MAGIC.to_le_bytes());
+    bytes.extend(VERSION.to_le_bytes());
+    bytes.extend((cloud.len() as u32).to_le_bytes());
+    bytes.extend([cloud.sh_degree.get(), bits as u8, 0, 0]);
+    let byte = |value: f32| value.round().clamp(0.0, 255.0) as u8;
+    for coordinate in cloud.means.iter().flat_map(|mean| mean.to_array()) {
+        let most = (1 << (POSITION_BITS - 1)) - 1;
+        let fixed = (f64::from(coordinate) * 2f64.powi(bits)).round() as i32;
+        bytes.extend(&fixed.clamp(-most, most).to_le_bytes()[..3]);
+    }
+    bytes.extend(cloud.raw_opacities.iter().map(|raw| byte(opacity_from_raw(*raw) * 255.0)));
+    let constants = cloud.sh.chunks(coefficients).flat_map(|sh| sh[0].to_array());
+    bytes.extend(constants.map(|value| byte((value * COLOR_SCALE + 0.5) * 255.0)));
+    let scales = cloud.log_scales.iter().flat_map(|scale| scale.to_array());
+    bytes.extend(scales.map(|scale| byte((scale + LOG_SCALE.0) * LOG_SCALE.1)));
+    bytes.extend(cloud.rotations.iter().flat_map(|rotation| smallest_three(*rotation).to_le_bytes()));
+    let harmonics = cloud.sh.chunks(coefficients).flat_map(|sh| sh[1..].iter().flat_map(|c| c.to_array()));
+    bytes.extend(harmonics.map(|value| byte(value * 128.0 + 128.0)));
+    let mut encoder = GzEncoder::new(Vec::new(), Compression::best());
+    encoder.write_all(&bytes).and_then(|()| encoder.finish()).map_err(|error| ExportError::Encode { reason: error.to_string() })
+}
+
+/// Bits behind the point: enough for small Gaussians, and few enough for the farthest.
+fn fractional_bits(cloud: &GaussianCloud) -> i32 {
+    let farthest = cloud.means.iter().map(|mean| mean.abs().max_element()).fold(1e-3, f32::max);
+    let most = POSITION_BITS - 1 - farthest.log2().floor() as i32 - 1;
+    let mut least: Vec<f32> = cloud.log_scales.iter().map(|scale| scale.min_element()).collect();
+    least.sort_unstable_by(f32::total_cmp);
+    let median = least.get(least.len() / 2).map_or(0.0, |log_scale| log_scale.clamp(-20.0, 0.0).exp());
+    let wanted = -(median.max(f32::MIN_POSITIVE) * STEP).log2().floor() as i32;
+    wanted.max(FRACTIONAL_BITS).min(most).clamp(0, POSITION_BITS - 1)
+}
+
+/// Sign and nine bits for each component but the largest, which is made positive; its index in the top bits.
+fn smallest_three(rotation: Quat) -> u32 {
+    let rotation = if rotation.length_squared() > f32::MIN_POSITIVE { rotation.normalize() } else { Quat::IDENTITY };
+    let q = rotation.to_array();
+    let largest = (0..4).fold(0, |largest, k| if q[k].abs() > q[largest].abs() { k } else { largest });
+    let flips = q[largest] < 0.0;
+    (0..4).filter(|k| *k != largest).fold(largest as u32, |bits, k| {
+        let magnitude = (q[k].abs() * std::f32::consts::SQRT_2 * 511.0).round().min(511.0) as u32;
+        bits << 10 | u32::from((q[k] < 0.0) != flips) << 9 | magnitude
+    })
+}
+
+fn from_smallest_three(mut bits: u32) -> Quat {
+    let largest = (bits >> 30) as usize;
+    let mut q = [0f32; 4];
+    for k in (0..4).rev().filter(|k| *k != largest) {
+        let magnitude = (bits & 511) as f32 / 511.0 * std::f32::consts::FRAC_1_SQRT_2;
+        q[k] = if bits >> 9 & 1 == 1 { -magnitude } else { magnitude };
+        bits >>= 10;
+    }
+    q[largest] = (1.0 - q.iter().map(|v| v * v).sum::<f32>()).max(0.0).sqrt();
+    Quat::from_array(q)
+}
+
+/// Version 2: three bytes, and a positive w.
+fn from_first_three(bytes: &[u8]) -> Quat {
+    let v = Vec3::new(f32::from(bytes[0]), f32::from(bytes[1]), f32::from(bytes[2])) / 127.5 - 1.0;
+    let w = (1.0 - v.length_squared()).max(0.0).sqrt();
+    Quat::from_xyzw(v.x, v.y, v.z, w).normalize()
+}
+
+fn decode(reader: &mut dyn BufRead, FileSize(file_bytes): FileSize, path: &Path) -> Result<GaussianCloud, ExportError> {
+    let damaged = |what: String| ExportError::Damaged { path: path.into(), what };
+    let mut start = [0u8; 4];
+    let peeked = reader.fill_buf().map_err(|source| ExportError::Read { path: path.into(), source })?;
+    let known = peeked.len().min(4);
+    start[..known].copy_from_slice(&peeked[..known]);
+    if u32::from_le_bytes(start) == MAGIC {
+        return Err(damaged("SPZ version 4 is not read; write version 3, or a PLY".into()));
+    }
+    let mut stream = MultiGzDecoder::new(reader);
+    let mut header = [0u8; HEADER];
+    stream.read_exact(&mut header).map_err(|_| damaged("this is no SPZ file".into()))?;
+    let word = |at: usize| u32::from_le_bytes(header[at..at + 4].try_into().expect("four bytes"));
+    let (magic, version, count) = (word(0), word(4), word(8) as u64);
+    let degree = ShDegree::new(header[12]).filter(|_| magic == MAGIC && (2..=3).contains(&version));
+    let degree = degree.ok_or_else(|| damaged(format!("version {version} of degree {} is not read", header[12])))?;
+    let bits = i32::from(header[13]);
+    if bits >= POSITION_BITS {
+        return Err(damaged(format!("{bits} of a position's 24 bits cannot be behind the point")));
+    }
+    let expected = count * stride(version, degree) as u64;
+    let cut = || damaged(format!("{count} Gaussians are promised, but the file is cut off or longer"));
+    if expected > file_bytes.saturating_mul(MOST_INFLATION) {
+        return Err(cut());
+    }
+    let mut bytes = Vec::new();
+    stream.take(expected + 1).read_to_end(&mut bytes).map_err(|_| cut())?;
+    if bytes.len() as u64 != expected {
+        return Err(cut());
+    }
+    Ok(turned(&unpack(&bytes, count as usize, version, degree, bits)))
+}
+
+/// The Gaussians of the attributes, which are as long as they should be.
+fn unpack(bytes: &[u8], count: usize, version: u32, degree: ShDegree, bits: i32) -> GaussianCloud {
+    let rotation_bytes = if version >= 3 { 4 } else { 3 };
+    let harmonics = degree.coefficients() - 1;
+    let (positions, rest) = bytes.split_at(9 * count);
+    let (opacities, rest) = rest.split_at(count);
+    let (colors, rest) = rest.split_at(3 * count);
+    let (scales, rest) = rest.split_at(3 * count);
+    let (rotations, sh) = rest.split_at(rotation_bytes * count);
+    let mut cloud = GaussianCloud::new(degree);
+    for i in 0..count {
+        let triple = |bytes: &[u8], at: usize| Vec3::new(bytes[at].into(), bytes[at + 1].into(), bytes[at + 2].into());
+        let coordinate = |c: usize| {
+            let at = 9 * i + 3 * c;
+            // The sign is that of the top byte.
+            let fixed = i32::from_le_bytes([0, positions[at], positions[at + 1], positions[at + 2]]) >> 8;
+            (f64::from(fixed) / 2f64.powi(bits)) as f32
+        };
+        let rotation = &rotations[rotation_bytes * i..rotation_bytes * (i + 1)];
+        let opacity = (f32::from(opacities[i]) / 255.0).clamp(OPACITIES.0, OPACITIES.1);
+        let constant = (triple(colors, 3 * i) / 255.0 - 0.5) / COLOR_SCALE;
+        let beyond = (0..harmonics).map(|k| (triple(sh, 3 * (i * harmonics + k)) - 128.0) / 128.0);
+        cloud.push(Gaussian {
+            mean: Vec3::new(coordinate(0), coordinate(1), coordinate(2)),
+            log_scale: triple(scales, 3 * i) / LOG_SCALE.1 - LOG_SCALE.0,
+            rotation: match rotation {
+                [a, b, c, d] => from_smallest_three(u32::from_le_bytes([*a, *b, *c, *d])),
+                three => from_first_three(three),
+            },
+            raw_opacity: raw_opacity_from_opacity(opacity),
+            sh: std::iter::once(constant).chain(beyond).collect(),
+        });
+    }
+    cloud
+}
