@@ -4,7 +4,8 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use glam::Vec3;
-use keysplat::export::{ExportFilter, MapFormat};
+use keysplat::export::{ExportFilter, MapFormat, fit_harmonics};
+use keysplat::geometry::{Se3, Trajectory};
 use keysplat::run_folder::outputs;
 use keysplat::splat::ShDegree;
 use miette::{IntoDiagnostic, miette};
@@ -62,6 +63,13 @@ fn find(path: &Path) -> miette::Result<(PathBuf, MapFormat)> {
     found.ok_or_else(|| miette!("{} is no map; give the folder of a run, or a file of {}", path.display(), known()))
 }
 
+/// Poses of a run's keyframes; none where only a map is there.
+fn cameras(path: &Path) -> Vec<Se3> {
+    let folder = if path.is_dir() { path } else { path.parent().unwrap_or(path) };
+    let keyframes = Trajectory::read_tum(&folder.join(outputs::KEYFRAMES)).unwrap_or_default();
+    keyframes.poses.iter().map(|pose| pose.world_from_camera).collect()
+}
+
 pub fn export(args: &ExportArgs, verbosity: Verbosity) -> miette::Result<()> {
     let (path, from) = find(&args.map)?;
     let to = args.format.or_else(|| MapFormat::of_path(&args.out));
@@ -72,6 +80,7 @@ pub fn export(args: &ExportArgs, verbosity: Verbosity) -> miette::Result<()> {
     if part.is_empty() {
         return Err(miette!("of {} Gaussians, none passes; widen --crop or lower --min-opacity", cloud.len()));
     }
+    let part = to.most_harmonic().map_or(part.clone(), |most| fit_harmonics(&part, &cameras(&args.map), most));
     let bytes = to.write(&part, &args.out).into_diagnostic()?.len();
     if verbosity.quiet {
         return Ok(());

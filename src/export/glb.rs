@@ -13,7 +13,7 @@ use serde_json::{Value, json};
 use super::axes::turned;
 use super::{ExportError, FileSize, FormatRow};
 use crate::splat::sh::SH_C0;
-use crate::splat::{Gaussian, GaussianCloud, ShDegree, opacity_from_raw, raw_opacity_from_opacity};
+use crate::splat::{Gaussian, GaussianCloud, ShDegree, opacity_from_raw, raw_opacity_from_opacity, unit_rotation};
 
 /// The format's row in the table of formats.
 pub(super) const FORMAT: FormatRow = FormatRow {
@@ -21,6 +21,7 @@ pub(super) const FORMAT: FormatRow = FormatRow {
     extension: "glb",
     help: "glTF binary with KHR_gaussian_splatting, float; engines and three.js read it.",
     is_lossless: false,
+    most_harmonic: None,
     encode,
     decode,
 };
@@ -78,7 +79,7 @@ fn attributes(cloud: &GaussianCloud) -> Vec<Attribute> {
         let [r, g, b] = (sh[0] * SH_C0 + 0.5).clamp(Vec3::ZERO, Vec3::ONE).to_array().map(linear);
         [r, g, b, opacity(raw)]
     };
-    let rotations = cloud.rotations.iter().map(|q| if q.length_squared() > 0.0 { q.normalize() } else { Quat::IDENTITY });
+    let rotations = cloud.rotations.iter().map(|rotation| unit_rotation(*rotation));
     let colors = cloud.sh.chunks(coefficients).zip(&cloud.raw_opacities).flat_map(color);
     let mut all = vec![
         vectors("POSITION".into(), &mut cloud.means.iter().copied()),

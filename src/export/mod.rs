@@ -5,10 +5,12 @@
 mod axes;
 mod filter;
 mod glb;
+mod harmonics;
 mod ply;
 mod spz;
 
 pub use filter::ExportFilter;
+pub use harmonics::fit_harmonics;
 
 use std::fs::File;
 use std::io::{BufRead, BufReader};
@@ -33,6 +35,8 @@ struct FormatRow {
     help: &'static str,
     /// Whether a map that is written and read again is written as the same bytes.
     is_lossless: bool,
+    /// Largest harmonic beyond the constant one that it holds, if that is limited.
+    most_harmonic: Option<f32>,
     /// The file's bytes, the same ones for the same map.
     encode: fn(&GaussianCloud) -> Result<Vec<u8>, ExportError>,
     /// Reads a file; the path is named in errors.
@@ -72,6 +76,11 @@ impl MapFormat {
     /// Whether a map that is written and read again is written as the same bytes.
     pub fn is_lossless(self) -> bool {
         self.0.is_lossless
+    }
+
+    /// Largest harmonic beyond the constant one that it holds, if that is limited; see [`fit_harmonics`].
+    pub fn most_harmonic(self) -> Option<f32> {
+        self.0.most_harmonic
     }
 
     /// Extension of its files, without the dot.

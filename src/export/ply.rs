@@ -10,7 +10,7 @@ use std::path::Path;
 use glam::{Quat, Vec3};
 
 use super::{ExportError, FileSize, FormatRow};
-use crate::splat::{Gaussian, GaussianCloud, ShDegree};
+use crate::splat::{Gaussian, GaussianCloud, ShDegree, unit_rotation};
 
 /// The format's row in the table of formats.
 pub(super) const FORMAT: FormatRow = FormatRow {
@@ -18,6 +18,7 @@ pub(super) const FORMAT: FormatRow = FormatRow {
     extension: "ply",
     help: "PLY of the 3D Gaussian Splatting reference code, binary little endian; every viewer reads it.",
     is_lossless: true,
+    most_harmonic: None,
     encode,
     decode,
 };
@@ -64,24 +65,10 @@ fn encode(cloud: &GaussianCloud) -> Result<Vec<u8>, ExportError> {
         }
         put(cloud.raw_opacities[i]);
         cloud.log_scales[i].to_array().into_iter().for_each(&mut put);
-        let [x, y, z, w] = unit(cloud.rotations[i]);
+        let [x, y, z, w] = unit_rotation(cloud.rotations[i]).to_array();
         [w, x, y, z].into_iter().for_each(&mut put);
     }
     Ok(bytes)
-}
-
-/// `x y z w` of unit length. What has it already, to f32's precision, stays as it is, so that exporting a read map gives the same
-/// bytes; a quaternion without length turns nothing.
-fn unit(rotation: Quat) -> [f32; 4] {
-    let q = rotation.to_array().map(f64::from);
-    let norm = q.iter().map(|v| v * v).sum::<f64>().sqrt();
-    if norm == 0.0 {
-        [0.0, 0.0, 0.0, 1.0]
-    } else if (norm - 1.0).abs() <= 2.0 * f64::from(f32::EPSILON) {
-        rotation.to_array()
-    } else {
-        q.map(|v| (v / norm) as f32)
-    }
 }
 
 /// Where the values lie in a vertex, bytes from its start.

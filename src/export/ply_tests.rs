@@ -168,9 +168,9 @@ fn an_empty_map_is_a_file_too() {
 #[test]
 fn quaternions_of_unit_length_keep_their_bits() {
     let almost = Quat::from_xyzw(0.5, 0.5, 0.5, 0.5 + f32::EPSILON / 2.0);
-    assert_eq!(unit(almost), almost.to_array());
-    assert_eq!(unit(Quat::from_xyzw(0.0, 1.2, 0.0, 1.6)), [0.0, 0.6, 0.0, 0.8]);
-    assert_eq!(unit(Quat::from_xyzw(0.0, 0.0, 0.0, 0.0)), [0.0, 0.0, 0.0, 1.0]);
+    assert_eq!(unit_rotation(almost).to_array(), almost.to_array());
+    assert_eq!(unit_rotation(Quat::from_xyzw(0.0, 1.2, 0.0, 1.6)).to_array(), [0.0, 0.6, 0.0, 0.8]);
+    assert_eq!(unit_rotation(Quat::from_xyzw(0.0, 0.0, 0.0, 0.0)).to_array(), [0.0, 0.0, 0.0, 1.0]);
 }
 
 #[test]

@@ -12,7 +12,7 @@ use glam::{Quat, Vec3};
 
 use super::axes::turned;
 use super::{ExportError, FileSize, FormatRow};
-use crate::splat::{Gaussian, GaussianCloud, ShDegree, opacity_from_raw, raw_opacity_from_opacity};
+use crate::splat::{Gaussian, GaussianCloud, ShDegree, opacity_from_raw, raw_opacity_from_opacity, unit_rotation};
 
 /// The format's row in the table of formats.
 pub(super) const FORMAT: FormatRow = FormatRow {
@@ -20,6 +20,7 @@ pub(super) const FORMAT: FormatRow = FormatRow {
     extension: "spz",
     help: "SPZ version 3: a tenth of the PLY's size, quantised; most web viewers read it.",
     is_lossless: false,
+    most_harmonic: Some(127.0 / 128.0),
     encode,
     decode,
 };
@@ -90,8 +91,7 @@ fn fractional_bits(cloud: &GaussianCloud) -> i32 {
 
 /// Sign and nine bits for each component but the largest, which is made positive; its index in the top bits.
 fn smallest_three(rotation: Quat) -> u32 {
-    let rotation = if rotation.length_squared() > f32::MIN_POSITIVE { rotation.normalize() } else { Quat::IDENTITY };
-    let q = rotation.to_array();
+    let q = unit_rotation(rotation).to_array();
     let largest = (0..4).fold(0, |largest, k| if q[k].abs() > q[largest].abs() { k } else { largest });
     let flips = q[largest] < 0.0;
     (0..4).filter(|k| *k != largest).fold(largest as u32, |bits, k| {

@@ -124,6 +124,20 @@ pub struct MapSnapshot {
     pub psnr_db: f32,
 }
 
+/// A rotation of unit length. What has it already, to f32's precision, stays as it is, so that doing this again changes nothing; a quaternion
+/// without length turns nothing.
+pub fn unit_rotation(rotation: Quat) -> Quat {
+    let q = rotation.to_array().map(f64::from);
+    let norm = q.iter().map(|v| v * v).sum::<f64>().sqrt();
+    if norm == 0.0 {
+        Quat::IDENTITY
+    } else if (norm - 1.0).abs() <= 2.0 * f64::from(f32::EPSILON) {
+        rotation
+    } else {
+        Quat::from_array(q.map(|v| (v / norm) as f32))
+    }
+}
+
 /// `logit`, the inverse of the sigmoid.
 pub fn raw_opacity_from_opacity(opacity: f32) -> f32 {
     (opacity / (1.0 - opacity)).ln()

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use glam::{Quat, Vec3};
 
-use crate::splat::{GaussianCloud, ShDegree, opacity_from_raw};
+use crate::splat::{GaussianCloud, ShDegree, opacity_from_raw, unit_rotation};
 
 /// Most Gaussians of a part of a chunk.
 pub const MOST_IN_PART: usize = 4096;
@@ -150,8 +150,8 @@ fn log_scale_bits(log_scale: f32) -> u32 {
 
 /// Smallest three: 10 bits a component, and the index of the largest one, which is made positive and left out.
 fn rotation_bits(rotation: Quat) -> u32 {
-    let rotation = if rotation.length_squared() > f32::MIN_POSITIVE { rotation.normalize() } else { Quat::IDENTITY };
-    let components = rotation.to_array();
+    // As files have it, so that a map and its file are packed alike.
+    let components = unit_rotation(rotation).to_array();
     let largest = (0..4).fold(0, |largest, k| if components[k].abs() > components[largest].abs() { k } else { largest });
     let sign = components[largest].signum();
     let kept = (0..4).filter(|k| *k != largest).enumerate();

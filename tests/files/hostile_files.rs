@@ -129,6 +129,12 @@ fn the_corpus_is_read_and_its_damaged_copies_do_no_harm() {
     }
 }
 
+fn gzip(bytes: &[u8]) -> Vec<u8> {
+    let mut encoder = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+    std::io::Write::write_all(&mut encoder, bytes).unwrap();
+    encoder.finish().unwrap()
+}
+
 #[test]
 fn lying_headers_cost_no_memory() {
     let names = [
@@ -139,6 +145,12 @@ fn lying_headers_cost_no_memory() {
     for count in [1u64 << 40, 1 << 58, u64::MAX] {
         let header = format!("ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}end_header\n");
         assert_eq!(parse("ply", &[header.as_bytes(), &[0; 4096]].concat()), 0);
+        let promised = (count as u32).max(1 << 31).to_le_bytes();
+        let spz = [&0x5053_474eu32.to_le_bytes()[..], &3u32.to_le_bytes(), &promised, &[3, 12, 0, 0], &[0; 4096]].concat();
+        assert_eq!(parse("spz", &gzip(&spz)), 0);
+        let json = format!(r#"{{"meshes":[],"accessors":[{{"componentType":5126,"count":{count},"type":"VEC3"}}]}}"#);
+        let glb = [b"glTF".as_slice(), &2u32.to_le_bytes(), &promised, &promised, b"JSON", json.as_bytes()].concat();
+        assert_eq!(parse("glb", &glb), 0);
         let model = [&count.to_le_bytes()[..], &[1; 4096]].concat();
         assert_eq!(parse("colmap", &model), 0);
         let mut atom = [0u8, 0, 0, 1, b'f', b't', b'y', b'p'].to_vec();

@@ -6,6 +6,7 @@ mod common;
 mod bad_input;
 mod check;
 mod end_to_end;
+mod export;
 mod faults;
 mod film;
 mod interaction;
