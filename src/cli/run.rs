@@ -9,6 +9,7 @@ use clap::Args;
 use indicatif::ProgressBar;
 use keysplat::config::SequenceConfig;
 use keysplat::export::MapFormat;
+use keysplat::mapping::RefineConfig;
 use keysplat::pipeline::{Outlook, Replay};
 use keysplat::presets::{self, Preset};
 use keysplat::sequence::{ASSUMED_CAMERA, is_camera_file};
@@ -192,12 +193,13 @@ pub fn replay(mut session: Session, view: &ViewOptions, verbosity: Verbosity) ->
     let viewed = view.start(&session, &progress, verbosity)?;
     progress::stop_on_ctrl_c(&progress)?;
     let frames = session.recording().sequence().entries.len() as u64;
+    let refine = session.recording().config().mapping.refine.clone();
     let shown = |work: &mut dyn FnMut() -> Result<Replay, SessionError>| {
         let done = AtomicBool::new(false);
         std::thread::scope(|scope| {
             let bar = progress::bar(verbosity, frames, "{wide_bar} {pos}/{len} frames  {msg}");
-            let (progress, done) = (&progress, &done);
-            scope.spawn(move || show(progress, &bar, done));
+            let (progress, refine, done) = (&progress, &refine, &done);
+            scope.spawn(move || show(progress, refine, &bar, done));
             let replayed = work();
             done.store(true, Ordering::Relaxed);
             replayed
@@ -244,9 +246,9 @@ fn print_end(finished: Result<Metrics, SessionError>, verbosity: Verbosity) -> m
 }
 
 /// Keeps the bar up to date, and heeds keys, until the run is done.
-fn show(progress: &Progress, bar: &ProgressBar, done: &AtomicBool) {
+fn show(progress: &Progress, refine: &RefineConfig, bar: &ProgressBar, done: &AtomicBool) {
     let keys = if bar.is_hidden() { None } else { Keys::listen() };
-    let mut outlook = Outlook::new(bar.length().unwrap_or(0) as usize);
+    let mut outlook = Outlook::new(bar.length().unwrap_or(0) as usize, refine);
     while !done.load(Ordering::Relaxed) {
         let state = outlook.look(progress);
         bar.set_position(state.frames as u64);

@@ -4,6 +4,7 @@ use std::time::Instant;
 
 use super::Progress;
 use super::progress::{MappingProgress, TrackingProgress};
+use crate::mapping::RefineConfig;
 
 /// The rate of frames is that of about so many seconds.
 const RATE_SECONDS: f64 = 20.0;
@@ -34,6 +35,8 @@ pub struct RunState {
 pub struct Outlook {
     started: Instant,
     all_frames: usize,
+    /// The refinement that follows.
+    refine: RefineConfig,
     /// Frames a second.
     rate: f64,
     /// Seconds and frames when it was measured.
@@ -41,9 +44,9 @@ pub struct Outlook {
 }
 
 impl Outlook {
-    /// Of a run over so many frames that begins now.
-    pub fn new(all_frames: usize) -> Self {
-        Self { started: Instant::now(), all_frames, rate: 0.0, last: None }
+    /// Of a run over so many frames, and the refinement after them, that begins now.
+    pub fn new(all_frames: usize, refine: &RefineConfig) -> Self {
+        Self { started: Instant::now(), all_frames, refine: refine.clone(), rate: 0.0, last: None }
     }
 
     /// Looks at the run; to be called every now and then.
@@ -70,13 +73,23 @@ impl Outlook {
         self.last = Some((s, frames));
     }
 
-    /// Frames that are left at the present rate; then the refinement's steps.
+    /// Frames that are left at the present rate, and the refinement's steps.
     fn left_s(&self, frames: usize, mapping: &MappingProgress) -> Option<f64> {
         match mapping.refinement {
             Some((done, Some(planned))) => Some((planned - done) as f64 * mapping.step_ms / 1e3),
             Some((_, None)) => None,
-            None => (self.rate > 0.0).then(|| self.all_frames.saturating_sub(frames) as f64 / self.rate),
+            None => (self.rate > 0.0).then(|| {
+                let frames_s = self.all_frames.saturating_sub(frames) as f64 / self.rate;
+                frames_s + self.refinement_s(frames, mapping)
+            }),
         }
+    }
+
+    /// Seconds of the refinement, with as many keyframes a frame as so far.
+    fn refinement_s(&self, frames: usize, mapping: &MappingProgress) -> f64 {
+        let keyframes = (mapping.keyframes * self.all_frames).div_ceil(frames.max(1));
+        let steps = self.refine.steps.max(self.refine.final_epochs * keyframes);
+        self.refine.seconds.unwrap_or(steps as f64 * mapping.step_ms / 1e3)
     }
 }
 
@@ -113,11 +126,13 @@ mod tests {
 
     #[test]
     fn time_left_is_that_of_the_frames_and_then_of_the_refinement() {
-        let mut outlook = Outlook::new(100);
+        let refine = RefineConfig { steps: 0, final_epochs: 3, seconds: None, ..RefineConfig::default() };
+        let mut outlook = Outlook::new(100, &refine);
         outlook.measure(0.0, 0);
         outlook.measure(2.0, 20);
-        let mapping = MappingProgress { gaussians: 5, psnr_db: 21.5, step_ms: 20.0, ..MappingProgress::default() };
-        assert_eq!(outlook.left_s(20, &mapping), Some(8.0));
+        let mapping = MappingProgress { keyframes: 10, gaussians: 5, psnr_db: 21.5, step_ms: 20.0, ..MappingProgress::default() };
+        // 80 frames at 10 a second, and three epochs over 50 keyframes.
+        assert_eq!(outlook.left_s(20, &mapping), Some(8.0 + 3.0));
         let refining = MappingProgress { refinement: Some((50, Some(250))), ..mapping };
         assert_eq!(outlook.left_s(100, &refining), Some(4.0));
         assert_eq!(outlook.left_s(100, &MappingProgress { refinement: Some((50, None)), ..mapping }), None);

@@ -147,7 +147,7 @@ struct Observer {
 
 impl Observer {
     fn new(desk: Arc<LiveDesk>) -> Self {
-        let outlook = Outlook::new(desk.recording.sequence().entries.len());
+        let outlook = Outlook::new(desk.recording.sequence().entries.len(), &desk.recording.config().mapping.refine);
         let now = Instant::now();
         Self {
             desk,
