@@ -243,7 +243,8 @@ impl Session {
 
     fn write_and_measure(&self, result: &RunResult, on_view: &dyn Fn(usize)) -> Result<Metrics, OutputError> {
         let map = outputs::write_results(&self.out, &self.recording, result)?;
-        let input = EvaluationInput::from(result);
+        // As the file holds it: a format may be coarser than the map.
+        let input = EvaluationInput { cloud: &map.cloud, ..EvaluationInput::from(result) };
         let evaluation = outputs::evaluate(&self.recording, &self.gpu, &input, &self.out, on_view)?;
         outputs::write_metrics(&self.out, &self.recording, &self.gpu, result, &map, evaluation)
     }

@@ -32,10 +32,12 @@ pub fn demo(args: &DemoArgs, verbosity: Verbosity) -> miette::Result<()> {
         return Ok(());
     }
     let (map, views) = (args.out.join("map.ply"), args.out.join("views"));
+    let program = std::env::current_exe().unwrap_or_else(|_| "keysplat".into());
     print(&format!(
-        "\nTo look at the map and the camera's path in a browser: keysplat view {}\n\
+        "\nTo look at the map and the camera's path in a browser: {} view {}\n\
          The map is {}; it opens in any viewer of Gaussian splats, too.\n\
          Held-out views beside their renders are in {}.\n",
+        program.display(),
         args.out.display(),
         map.display(),
         views.display()

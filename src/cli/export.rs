@@ -74,13 +74,20 @@ pub fn export(args: &ExportArgs, verbosity: Verbosity) -> miette::Result<()> {
     let (path, from) = find(&args.map)?;
     let to = args.format.or_else(|| MapFormat::of_path(&args.out));
     let to = to.ok_or_else(|| miette!("{} does not say its format; end it in .ply, .spz or .glb", args.out.display()))?;
+    let same = |path: &Path| std::fs::canonicalize(path).ok();
+    if same(&args.out).is_some_and(|out| Some(out) == same(&path)) {
+        return Err(miette!("{} is the map that is exported; choose another file", path.display()));
+    }
     let ExportArgs { max_gaussians, min_opacity, sh_degree, crop, .. } = *args;
     let cloud = from.read(&path).into_diagnostic()?;
     let part = ExportFilter { crop, min_opacity, max_gaussians, sh_degree }.apply(&cloud);
     if part.is_empty() {
         return Err(miette!("of {} Gaussians, none passes; widen --crop or lower --min-opacity", cloud.len()));
     }
-    let part = to.most_harmonic().map_or(part.clone(), |most| fit_harmonics(&part, &cameras(&args.map), most));
+    let part = match to.most_harmonic() {
+        Some(most) => fit_harmonics(&part, &cameras(&args.map), most),
+        None => part,
+    };
     let bytes = to.write(&part, &args.out).into_diagnostic()?.len();
     if verbosity.quiet {
         return Ok(());

@@ -21,6 +21,7 @@ pub(super) const FORMAT: FormatRow = FormatRow {
     extension: "glb",
     help: "glTF binary with KHR_gaussian_splatting, float; engines and three.js read it.",
     is_lossless: false,
+    tolerance: 5e-5,
     most_harmonic: None,
     encode,
     decode,
@@ -31,6 +32,10 @@ const MAGIC: u32 = 0x4654_6c67;
 const JSON_CHUNK: u32 = 0x4e4f_534a;
 const BINARY_CHUNK: u32 = 0x004e_4942;
 const FLOAT: u64 = 5126;
+/// Extents stay finite.
+const LARGEST: Vec3 = Vec3::splat(1e37);
+/// Bytes between two elements, at most.
+const MOST_STRIDE: usize = 252;
 /// Opacities whose logits are finite.
 const OPACITIES: (f32, f32) = (1e-6, 1.0 - 1e-6);
 
@@ -85,7 +90,7 @@ fn attributes(cloud: &GaussianCloud) -> Vec<Attribute> {
         vectors("POSITION".into(), &mut cloud.means.iter().copied()),
         Attribute { name: "COLOR_0".into(), kind: "VEC4", values: colors.collect() },
         Attribute { name: format!("{EXTENSION}:ROTATION"), kind: "VEC4", values: rotations.flat_map(|q| q.to_array()).collect() },
-        vectors(format!("{EXTENSION}:SCALE"), &mut cloud.log_scales.iter().map(|scale| scale.exp())),
+        vectors(format!("{EXTENSION}:SCALE"), &mut cloud.log_scales.iter().map(|scale| scale.exp().min(LARGEST))),
         Attribute {
             name: format!("{EXTENSION}:OPACITY"),
             kind: "SCALAR",
@@ -210,6 +215,11 @@ impl Document {
         let primitives = self.meshes.iter().flat_map(|mesh| &mesh.primitives);
         let primitive = primitives.into_iter().find(|primitive| primitive.extensions.contains_key(EXTENSION));
         let primitive = primitive.ok_or_else(|| format!("it has no Gaussians ({EXTENSION})"))?;
+        let extension = &primitive.extensions[EXTENSION];
+        let is = |key: &str, only: &str| extension.get(key).is_none_or(|value| value == only);
+        if !is("kernel", "ellipse") || !is("colorSpace", "srgb_rec709_display") {
+            return Err("only ellipses in the colours of sRGB are read".into());
+        }
         let moves = |node: &Value| ["matrix", "rotation", "translation", "scale"].iter().any(|key| node.get(key).is_some());
         if self.nodes.iter().any(moves) {
             return Err("transforms of nodes are not read; apply them first".into());
@@ -233,7 +243,7 @@ impl Document {
             let rotation = Quat::from_slice(&rotations[4 * i..4 * i + 4]);
             let gaussian = Gaussian {
                 mean: vector(&positions),
-                log_scale: vector(&scales).max(Vec3::splat(f32::MIN_POSITIVE)).map(f32::ln),
+                log_scale: vector(&scales).clamp(Vec3::splat(f32::MIN_POSITIVE), LARGEST).map(f32::ln),
                 rotation,
                 raw_opacity: raw_opacity_from_opacity(opacities[i].clamp(OPACITIES.0, OPACITIES.1)),
                 sh: harmonics.iter().map(|values| vector(values)).collect(),
@@ -266,11 +276,64 @@ impl Document {
         let needed = accessor.count.checked_mul(stride).and_then(|bytes| bytes.checked_add(accessor.byte_offset));
         // The last element may end before its stride does.
         let slack = stride.saturating_sub(4 * components);
-        if stride < 4 * components || needed.is_none_or(|needed| needed > bytes.len() + slack) {
+        if !(4 * components..=MOST_STRIDE).contains(&stride) || needed.is_none_or(|needed| needed > bytes.len() + slack) {
             return Err(format!("{name} is cut off"));
         }
         let element = |i: usize| (0..components).map(move |c| accessor.byte_offset + i * stride + 4 * c);
         let float = |at: usize| f32::from_le_bytes(bytes[at..at + 4].try_into().expect("four bytes"));
         Ok((0..accessor.count).flat_map(element).map(float).collect())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// One Gaussian, as the extension's text has it.
+    #[test]
+    fn a_file_of_others_is_read() {
+        let attributes: [(&str, &str, &[f32]); 5] = [
+            ("POSITION", "VEC3", &[1.0, 2.0, -3.0]),
+            ("KHR_gaussian_splatting:ROTATION", "VEC4", &[0.0, 0.6, 0.0, 0.8]),
+            ("KHR_gaussian_splatting:SCALE", "VEC3", &[2.0, 1.0, 0.5]),
+            ("KHR_gaussian_splatting:OPACITY", "SCALAR", &[0.75]),
+            ("KHR_gaussian_splatting:SH_DEGREE_0_COEF_0", "VEC3", &[0.1, 0.2, 0.3]),
+        ];
+        let binary: Vec<u8> = attributes.iter().flat_map(|a| a.2).flat_map(|value| value.to_le_bytes()).collect();
+        let file = |extension: Value| {
+            let mut offset = 0;
+            let (mut views, mut accessors, mut names) = (Vec::new(), Vec::new(), serde_json::Map::new());
+            for (k, (name, kind, values)) in attributes.iter().enumerate() {
+                views.push(json!({ "buffer": 0, "byteOffset": offset, "byteLength": 4 * values.len() }));
+                accessors.push(json!({ "bufferView": k, "componentType": 5126, "count": 1, "type": kind }));
+                names.insert((*name).into(), json!(k));
+                offset += 4 * values.len();
+            }
+            let primitive = json!({ "mode": 0, "attributes": names, "extensions": { "KHR_gaussian_splatting": extension } });
+            let document = json!({ "meshes": [{ "primitives": [primitive] }], "bufferViews": views, "accessors": accessors });
+            let mut text = document.to_string().into_bytes();
+            text.resize(text.len().next_multiple_of(4), b' ');
+            let length = (28 + text.len() + binary.len()) as u32;
+            let chunk = |name: &[u8], body: &[u8]| [&(body.len() as u32).to_le_bytes(), name, body].concat();
+            [b"glTF".as_slice(), &2u32.to_le_bytes(), &length.to_le_bytes(), &chunk(b"JSON", &text), &chunk(b"BIN\0", &binary)]
+                .concat()
+        };
+        let decode = |bytes: &[u8]| decode(&mut &*bytes, FileSize(bytes.len() as u64), Path::new("x.glb"));
+        let cloud = decode(&file(json!({ "kernel": "ellipse", "colorSpace": "srgb_rec709_display" }))).unwrap();
+        let only = cloud.get(0);
+        assert_eq!((cloud.len(), only.mean, only.sh), (1, Vec3::new(1.0, -2.0, 3.0), vec![Vec3::new(0.1, 0.2, 0.3)]));
+        assert!(only.log_scale.distance(Vec3::new(2f32.ln(), 0.0, 0.5f32.ln())) < 1e-6);
+        assert!((only.raw_opacity - 3f32.ln()).abs() < 1e-5 && only.rotation == Quat::from_xyzw(0.0, -0.6, 0.0, 0.8));
+        let linear = decode(&file(json!({ "kernel": "ellipse", "colorSpace": "lin_rec709_display" }))).unwrap_err();
+        assert!(linear.to_string().contains("sRGB"), "{linear}");
+    }
+
+    #[test]
+    fn huge_gaussians_stay_finite() {
+        let mut cloud = GaussianCloud::new(ShDegree::default());
+        let (mean, rotation) = (Vec3::ZERO, Quat::IDENTITY);
+        cloud.push(Gaussian { mean, log_scale: Vec3::splat(200.0), rotation, raw_opacity: 60.0, sh: vec![Vec3::ZERO] });
+        let bytes = encode(&cloud).unwrap();
+        assert_eq!(decode(&mut &*bytes, FileSize(bytes.len() as u64), Path::new("x.glb")).unwrap().first_non_finite(), None);
     }
 }

@@ -17,6 +17,7 @@ const RIDGE: f64 = 1e-5;
 /// A constant harmonic beyond this gives no colour between black and white.
 const MOST_CONSTANT: f64 = 3.3;
 const SWEEPS: usize = 1000;
+const SETTLED: f64 = 1e-6;
 /// A camera sees what lies so near its axis, as cosine.
 const CONE: f64 = 0.7;
 
@@ -60,9 +61,15 @@ fn bounded(normal: &Normal, wanted: &Coefficients, most: f64, count: usize) -> C
     let cut = |k: usize, value: f64| if k == 0 { value.clamp(-MOST_CONSTANT, MOST_CONSTANT) } else { value.clamp(-most, most) };
     let mut found = Coefficients::from_fn(|k, _| cut(k, wanted[k]));
     for _ in 0..SWEEPS {
+        let mut change = 0f64;
         for k in 0..count {
             let slope = normal.row(k).tr_dot(&(found - wanted));
-            found[k] = cut(k, found[k] - slope / normal[(k, k)]);
+            let better = cut(k, found[k] - slope / normal[(k, k)]);
+            change = change.max((better - found[k]).abs());
+            found[k] = better;
+        }
+        if change < SETTLED {
+            break;
         }
     }
     found

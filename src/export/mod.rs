@@ -35,6 +35,8 @@ struct FormatRow {
     help: &'static str,
     /// Whether a map that is written and read again is written as the same bytes.
     is_lossless: bool,
+    /// Largest error of a value but positions, whose error is a fiftieth of it.
+    tolerance: f32,
     /// Largest harmonic beyond the constant one that it holds, if that is limited.
     most_harmonic: Option<f32>,
     /// The file's bytes, the same ones for the same map.
@@ -76,6 +78,11 @@ impl MapFormat {
     /// Whether a map that is written and read again is written as the same bytes.
     pub fn is_lossless(self) -> bool {
         self.0.is_lossless
+    }
+
+    /// Largest error of a value but positions, whose error is a fiftieth of it.
+    pub fn tolerance(self) -> f32 {
+        self.0.tolerance
     }
 
     /// Largest harmonic beyond the constant one that it holds, if that is limited; see [`fit_harmonics`].
@@ -306,8 +313,7 @@ mod tests {
                 assert_eq!(MapFormat::of_path(&path), Some(format));
                 let back = format.read(&path).unwrap();
                 assert_eq!(back.sh_degree, cloud.sh_degree);
-                // SPZ has bytes for most values.
-                let (rough, fine) = if format.name() == "spz" { (0.06, 1e-3) } else { (1e-5, 1e-5) };
+                let (rough, fine) = (format.tolerance(), format.tolerance() / 50.0);
                 let close = |a: Vec3, b: Vec3| a.distance(b) < rough;
                 assert!(back.means.iter().zip(&cloud.means).all(|(a, b)| a.distance(*b) < fine));
                 assert!(back.log_scales.iter().zip(&cloud.log_scales).all(|(&a, &b)| close(a, b)));

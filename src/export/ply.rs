@@ -18,6 +18,7 @@ pub(super) const FORMAT: FormatRow = FormatRow {
     extension: "ply",
     help: "PLY of the 3D Gaussian Splatting reference code, binary little endian; every viewer reads it.",
     is_lossless: true,
+    tolerance: 1e-6,
     most_harmonic: None,
     encode,
     decode,

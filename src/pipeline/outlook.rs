@@ -55,8 +55,12 @@ impl Outlook {
         let tracking = progress.tracking().get().map(|tracking| *tracking).unwrap_or_default();
         let mapping = progress.mapping().get().map(|mapping| *mapping).unwrap_or_default();
         let frames = tracking.frames_done;
-        self.measure(s, frames);
         let paused = progress.control().is_paused();
+        if paused {
+            // Its time is none of the rate's.
+            self.last = Some((s, frames));
+        }
+        self.measure(s, frames);
         let left_s = self.left_s(frames, &mapping).filter(|_| !paused);
         RunState { s, frames, all_frames: self.all_frames, tracking, mapping, rate: self.rate, left_s, paused }
     }

@@ -15,7 +15,7 @@ use crate::evaluation::views::{ComparedView, ViewSelection, ViewSource, evaluate
 use crate::evaluation::{
     Alignment, Comparison, Exposures, draw_trajectory, evaluate_trajectory, machine, sha256_hex, write_json,
 };
-use crate::export::{ExportError, MapFormat};
+use crate::export::{ExportError, MapFormat, fit_harmonics};
 use crate::files::{WriteError, remove_partials, write_atomically};
 use crate::geometry::{Se3, Trajectory};
 use crate::gpu::{Gpu, GpuError};
@@ -151,6 +151,8 @@ pub struct WrittenMap {
     pub bytes: u64,
     /// SHA-256, hexadecimal.
     pub hash: String,
+    /// The map as the file holds it.
+    pub cloud: Arc<GaussianCloud>,
 }
 
 /// Writes trajectories, map, records and the resolved configuration. Metrics of an earlier run in the same folder are removed first: they
@@ -172,8 +174,14 @@ pub fn write_results(out: &Path, recording: &Recording, result: &RunResult) -> R
         remove_file(&out.join(map_name(*format)))?;
     }
     let format = recording.config().map_format;
-    let bytes = format.write(&result.cloud, &out.join(map_name(format)))?;
-    Ok(WrittenMap { bytes: bytes.len() as u64, hash: sha256_hex(&bytes) })
+    let poses = || result.keyframes.iter().map(|keyframe| keyframe.world_from_camera).collect::<Vec<_>>();
+    let map = match format.most_harmonic() {
+        Some(most) => Arc::new(fit_harmonics(&result.cloud, &poses(), most)),
+        None => result.cloud.clone(),
+    };
+    let bytes = format.write(&map, &out.join(map_name(format)))?;
+    let cloud = if format.is_lossless() { map } else { Arc::new(format.decode(&bytes)?) };
+    Ok(WrittenMap { bytes: bytes.len() as u64, hash: sha256_hex(&bytes), cloud })
 }
 
 /// Errors of a trajectory and a map against their recording.

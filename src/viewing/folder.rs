@@ -26,6 +26,8 @@ use crate::run_folder::{History, outputs};
 use crate::sequence::SensorKind;
 use crate::splat::{GaussianCloud, ViewCamera};
 
+/// Poses of a path; longer ones are thinned.
+const MOST_POSES: usize = 20_000;
 /// The only one of files.
 const REVISION: u64 = 1;
 
@@ -78,7 +80,7 @@ impl Finished {
         put(&board.map, PackedMap::new(&files.cloud, REVISION, None));
         let loops = files.history.as_ref().map_or_else(Vec::new, |history| history.loops.clone());
         put(&board.frames, Frames { keyframes: keyframes.clone(), loops, current: None });
-        put(&board.path, camera_path(&files.trajectory, files.comparison.as_ref()));
+        put(&board.path, camera_path(&files.trajectory, files.comparison.as_ref(), MOST_POSES));
         board.statistics.store(Arc::new(files.statistics()));
         let adapter = files.recording.as_ref().and_then(|r| r.config().adapter.clone());
         let Files { cloud, recording, .. } = files;

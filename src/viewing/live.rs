@@ -23,6 +23,8 @@ use crate::splat::{MapSnapshot, ViewCamera};
 /// How often the thread looks.
 const LOOK_EVERY: Duration = Duration::from_millis(100);
 const STATISTICS_EVERY: Duration = Duration::from_secs(1);
+/// Poses of the path, which is sent anew each time.
+const MOST_POSES: usize = 2000;
 const PATH_EVERY: Duration = Duration::from_secs(2);
 const IMAGE_EVERY: Duration = Duration::from_millis(200);
 /// A viewer's picture has to be there after this time.
@@ -249,7 +251,7 @@ impl Observer {
             let errors = evaluate_trajectory(truth, &estimate, Alignment::of(sequence.sensor.kind())).ok()?;
             Some(Comparison::of(&estimate, Some((truth, &errors))))
         });
-        put(&self.desk.board.path, camera_path(&estimate, errors.as_ref()));
+        put(&self.desk.board.path, camera_path(&estimate, errors.as_ref(), MOST_POSES));
         self.path_of = Some(poses);
         true
     }

@@ -148,9 +148,26 @@ fn lying_headers_cost_no_memory() {
         let promised = (count as u32).max(1 << 31).to_le_bytes();
         let spz = [&0x5053_474eu32.to_le_bytes()[..], &3u32.to_le_bytes(), &promised, &[3, 12, 0, 0], &[0; 4096]].concat();
         assert_eq!(parse("spz", &gzip(&spz)), 0);
-        let json = format!(r#"{{"meshes":[],"accessors":[{{"componentType":5126,"count":{count},"type":"VEC3"}}]}}"#);
-        let glb = [b"glTF".as_slice(), &2u32.to_le_bytes(), &promised, &promised, b"JSON", json.as_bytes()].concat();
-        assert_eq!(parse("glb", &glb), 0);
+        for stride in [12, u64::MAX] {
+            let names = ["POSITION", "ROTATION", "SCALE", "OPACITY", "SH_DEGREE_0_COEF_0"];
+            let kinds = ["VEC3", "VEC4", "VEC3", "SCALAR", "VEC3"];
+            let name = |name: &str| format!("{}{name}", if name == "POSITION" { "" } else { "KHR_gaussian_splatting:" });
+            let attributes: serde_json::Map<_, _> = (0..5).map(|k| (name(names[k]), serde_json::json!(k))).collect();
+            let accessor =
+                |k: usize| serde_json::json!({ "bufferView": 0, "componentType": 5126, "count": count, "type": kinds[k] });
+            let document = serde_json::json!({
+                "meshes": [{ "primitives": [{ "attributes": attributes, "extensions": { "KHR_gaussian_splatting": {} } }] }],
+                "bufferViews": [{ "buffer": 0, "byteLength": 64, "byteStride": stride }],
+                "accessors": (0..5).map(accessor).collect::<Vec<_>>(),
+            });
+            let mut text = document.to_string().into_bytes();
+            text.resize(text.len().next_multiple_of(4), b' ');
+            let length = (28 + text.len() + 64) as u32;
+            let start = [b"glTF".as_slice(), &2u32.to_le_bytes(), &length.to_le_bytes()].concat();
+            let json = [&(text.len() as u32).to_le_bytes(), b"JSON".as_slice(), &text].concat();
+            let glb = [start, json, [&64u32.to_le_bytes(), b"BIN\0".as_slice(), &[0; 64]].concat()].concat();
+            assert_eq!(parse("glb", &glb), 0);
+        }
         let model = [&count.to_le_bytes()[..], &[1; 4096]].concat();
         assert_eq!(parse("colmap", &model), 0);
         let mut atom = [0u8, 0, 0, 1, b'f', b't', b'y', b'p'].to_vec();

@@ -45,6 +45,7 @@ fn what_cannot_be_exported_is_refused() {
     export(&scratch().join("nothing"), &out, &[]).refused(&["nothing is no map"]);
     export(&map, &out, &["--crop", "50,50,50:60,60,60"]).refused(&["of 9 Gaussians, none passes"]);
     export(&map, &scratch().join("nowhere/x.glb"), &[]).refused(&["nowhere/x.glb"]);
+    export(&map, &map, &[]).refused(&["small.ply is the map that is exported"]);
     std::fs::write(&out, b"\x1f\x8b and no more").unwrap();
     export(&out, &scratch().join("y.ply"), &[]).refused(&["x.spz", "this is no SPZ file"]);
     assert!(!scratch().join("y.ply").exists());

@@ -211,7 +211,7 @@ export class Actions {
   }
 
   askFinish() {
-    askDialog(this.root, "Finish the run? keysplat writes its results and ends, as with Ctrl-C.", "Finish", () => this.control("finish"));
+    askDialog(this.root, "Finish the run? keysplat writes its results; the view stays open.", "Finish", () => this.control("finish"));
   }
 
   togglePanel() {
@@ -229,7 +229,10 @@ export class Actions {
   keyDown(event) {
     const kind = event.target.tagName;
     const typing = kind === "INPUT" && event.target.type !== "checkbox";
-    if (this.fatal || event.ctrlKey || event.metaKey || event.altKey || event.defaultPrevented || this.root.querySelector("dialog[open]")) {
+    // On many keyboards the brackets need AltGr.
+    const bracket = event.key === "[" || event.key === "]";
+    const modified = !bracket && (event.ctrlKey || event.metaKey || event.altKey);
+    if (this.fatal || modified || event.defaultPrevented || this.root.querySelector("dialog[open]")) {
       return;
     }
     // Space and enter press a button that has the focus.

@@ -73,6 +73,8 @@ export class Compare {
     this.hideExact();
     this.section.hidden = true;
     this.hooks.closed();
+    // Else the focus, and with it the keys, would be lost.
+    this.stage.canvas.focus({ preventScroll: true });
   }
 
   say(text) {
@@ -111,8 +113,8 @@ export class Compare {
     this.slider.disabled = !on || this.toggle.checked;
   }
 
-  refused(why) {
-    if (this.isOpen && !this.hasRecorded) {
+  refused({ what, why }) {
+    if (this.isOpen && (what === "render" || (what === "keyframe" && !this.hasRecorded))) {
       this.say(why);
     }
   }

@@ -1,4 +1,4 @@
-// Where messages come from: a WebSocket that is opened again when it closes, or the elements of a report.
+// A WebSocket that is opened again when it closes, and messages in their order.
 
 const FIRST_PAUSE_MS = 500;
 const LONGEST_PAUSE_MS = 15000;

@@ -195,7 +195,7 @@ class Viewer extends Actions {
   takePath(message) {
     this.scene.takePath(message);
     const range = this.scene.errorRange();
-    this.panel.setError(range === null ? null : lengthText(range, this.scene.units));
+    this.panel.setError(range === null ? null : lengthText(range, "metres"));
     this.stage.invalidate();
   }
 
@@ -230,8 +230,10 @@ class Viewer extends Actions {
   }
 
   takeRefused(message) {
-    this.compare.refused(message.why);
-    this.exact.hide();
+    this.compare.refused(message);
+    if (message.what === "render") {
+      this.exact.hide();
+    }
     this.overlay.note(`Not done: ${message.why}`);
   }
 

@@ -1,7 +1,6 @@
 // Vectors, rotations and cameras. Vectors are arrays of 3, quaternions arrays [x, y, z, w]; a pose {p, q} is world-from-camera.
 
 export const NEAR_METRES = 0.05;
-export const FAR_METRES = 1e5;
 const TANGENT_MARGIN = 0.15;
 
 export function add3(a, b) {

@@ -2,7 +2,7 @@
 
 export class MessageError extends Error {}
 
-// The other end speaks another version: nothing that it says can be read.
+// Another version of the protocol: its messages cannot be read.
 export class ProtocolError extends MessageError {}
 
 export const PROTOCOL = 1;

@@ -52,7 +52,11 @@ export class Overlay {
   }
 
   togglePanel() {
+    const inPanel = this.root.querySelector(".panel")?.contains(document.activeElement);
     this.root.classList.toggle("bare");
+    if (inPanel) {
+      this.canvas.focus({ preventScroll: true });
+    }
   }
 
   async toggleScreen() {

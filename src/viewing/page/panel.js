@@ -4,8 +4,6 @@ import { element, iconButton, changeIcon, checkbox, setText, countText, fixedTex
 import { LINE_COLORS } from "./lines.js";
 import { Plots } from "./plots.js";
 
-const PHASES = { tracking: "tracking", refining: "refining", measuring: "measuring", done: "done" };
-
 const FIGURES = [
   ["Frames", (s, hello) => hello && hello.frames ? `${countText(s.frames)} / ${countText(hello.frames)}` : countText(s.frames)],
   ["Keyframes", s => countText(s.keyframes)],
@@ -148,7 +146,7 @@ export class Panel {
     if (!this.latest) {
       return "";
     }
-    const words = [PHASES[this.latest.phase] || this.latest.phase];
+    const words = [this.latest.phase];
     if (this.latest.paused) {
       words.push("paused");
     }
