@@ -253,6 +253,10 @@ fn a_browser_draws_the_map_as_we_do() {
         page.wait_until("[...document.querySelectorAll('#viewer .compare')].some(element => !element.hidden)");
         page.press("Escape", "Escape", 27);
         page.wait_until("[...document.querySelectorAll('#viewer .compare')].every(element => element.hidden)");
+        page.press("m", "KeyM", 77);
+        page.wait_until(
+            "/keyframes see the point|no Gaussian at this point/.test(document.querySelector('#viewer .note').textContent)",
+        );
         page.press("?", "Slash", 191);
         page.wait_until("document.querySelector('#viewer dialog[open]') !== null");
         page.press("Escape", "Escape", 27);

@@ -8,7 +8,7 @@ const PICK_PIXELS = 8;
 const PICK_PIXELS_TOUCH = 18;
 const COUNT_AGAIN_MS = 2500;
 
-const EFFECTS = new Map([["KeyF", "follow"], ["KeyC", "nextColoring"], ["KeyX", "askExact"], ["KeyP", "togglePanel"], ["KeyN", "stepOnce"]]);
+const EFFECTS = new Map([["KeyF", "follow"], ["KeyC", "nextColoring"], ["KeyX", "askExact"], ["KeyP", "togglePanel"], ["KeyN", "stepOnce"], ["KeyM", "markCentre"]]);
 
 // The viewer's half that acts for the user; the other half takes messages.
 export class Actions {
@@ -123,11 +123,17 @@ export class Actions {
     }
   }
 
+  // The point in the middle, for those without a pointer.
+  markCentre() {
+    const { canvas } = this.overlay;
+    this.doubled(canvas.clientWidth / 2, canvas.clientHeight / 2);
+  }
+
   async doubled(x, y) {
     const point = await this.stage.pointAt(x, y);
     if (!point) {
       this.stage.marked = null;
-      this.overlay.note("There is no Gaussian under the pointer.");
+      this.overlay.note("There is no Gaussian at this point.");
     } else {
       this.stage.marked = this.scene.containing(point);
       const place = point.map(v => v.toFixed(2)).join(", ");

@@ -5,7 +5,7 @@ import { element, iconButton } from "./dom.js";
 const HELP_ROWS = [
   ["drag", "orbit"], ["right drag, shift drag, two fingers", "move sideways"], ["wheel, pinch, + −", "nearer, farther"],
   ["W A S D, Q E", "fly; with shift faster"], ["arrow keys", "turn"], ["0", "whole scene"], ["f", "follow the camera"],
-  ["click on a keyframe", "stand in it and compare"], ["[ ]", "previous, next keyframe"], ["double click", "keyframes that see a point"],
+  ["click on a keyframe", "stand in it and compare"], ["[ ]", "previous, next keyframe"], ["double click, m", "keyframes that see the point, the middle one"],
   ["c", "next colouring"], ["x", "exact picture"], ["space", "pause, go"], ["n", "one step"], ["p", "panel"], ["?", "this help"], ["Escape", "close"],
 ];
 
