@@ -4,7 +4,6 @@
 //! |---|---|---|
 //! | reader → tracker: [`Frame`](crate::sequence::Frame) | bounded channel | deterministic: blocks; real time: the frame is dropped and counted |
 //! | tracker → mapper: [`MapperMessage`](crate::mapping::MapperMessage) | bounded channel | deterministic: blocks; real time: the newest keyframe waits, older ones are counted as deferred |
-//! | mapper → tracker: pose feedback | bounded channel | deterministic: never full; real time: dropped |
 //! | all → viewers: [`Newest`] values, [`MapSnapshot`](crate::splat::MapSnapshot) among them | one slot each | newest wins |
 //! | viewers → mapper: [`RenderOrder`] | bounded queue | refused |
 //!

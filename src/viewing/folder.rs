@@ -11,8 +11,8 @@ use super::delivery::Delivery;
 use super::error::ViewError;
 use super::packing::PackedMap;
 use super::path::camera_path;
-use super::pictures::{self, RecordedImages};
-use super::protocol::{CameraView, Command, Hello, KeyframeView, Outgoing, PROTOCOL, Phase, RenderRequest, Statistics, ToViewer};
+use super::pictures::RecordedImages;
+use super::protocol::{CameraView, Command, Hello, KeyframeView, Outgoing, PROTOCOL, Phase, Statistics, ToViewer};
 use super::server::Desk;
 use crate::config::{Config, ConfigError};
 use crate::evaluation::{Comparison, Metrics};
@@ -23,7 +23,7 @@ use crate::mapping::KeyframeReport;
 use crate::recording::Recording;
 use crate::render::{GpuCloud, Rasterizer, Rendered};
 use crate::run_folder::{History, outputs};
-use crate::sequence::SensorKind;
+use crate::sequence::{RectifiedImage, SensorKind};
 use crate::splat::{GaussianCloud, ViewCamera};
 
 /// Poses of a path; longer ones are thinned.
@@ -227,7 +227,16 @@ fn json<T: DeserializeOwned>(folder: &Path, name: &str) -> Option<T> {
 }
 
 impl FolderDesk {
-    fn recorded(&self, id: usize) -> Result<(usize, crate::sequence::RectifiedImage), String> {
+    fn open_renderer(&self) -> Result<Renderer, GpuError> {
+        let gpu = Gpu::open(self.adapter.as_deref())?;
+        let mut cloud = GpuCloud::new(&gpu, self.cloud.sh_degree, self.cloud.len())?;
+        cloud.append(&gpu, &self.cloud)?;
+        Ok(Renderer { rasterizer: Rasterizer::new(gpu)?, cloud })
+    }
+}
+
+impl Desk for FolderDesk {
+    fn recorded(&self, id: usize) -> Result<(usize, RectifiedImage), String> {
         let missing = "the recording of this run is not there";
         let (recording, images) = self.recording.as_ref().zip(self.images.as_ref()).ok_or(missing)?;
         let keyframe = self.keyframes.iter().find(|view| view.id == id).ok_or("there is no such keyframe")?;
@@ -241,27 +250,6 @@ impl FolderDesk {
         }
         let Renderer { rasterizer, cloud } = renderer.as_mut().expect("it was just opened");
         rasterizer.render(cloud, camera, [0.0; 3]).map_err(|error| error.to_string())
-    }
-
-    fn open_renderer(&self) -> Result<Renderer, GpuError> {
-        let gpu = Gpu::open(self.adapter.as_deref())?;
-        let mut cloud = GpuCloud::new(&gpu, self.cloud.sh_degree, self.cloud.len())?;
-        cloud.append(&gpu, &self.cloud)?;
-        Ok(Renderer { rasterizer: Rasterizer::new(gpu)?, cloud })
-    }
-}
-
-impl Desk for FolderDesk {
-    fn keyframe(&self, id: usize) -> Result<Outgoing, String> {
-        let (frame, image) = self.recorded(id)?;
-        pictures::recorded(&image, id, frame)
-    }
-
-    fn render(&self, request: &RenderRequest) -> Result<Outgoing, String> {
-        let (pinhole, world_from_camera) = request.camera().ok_or("a picture has 16 to 1920 pixels along a side, and a pose")?;
-        let camera = ViewCamera { pinhole, camera_from_world: world_from_camera.inverse() };
-        let recorded = request.id.map(|id| self.recorded(id)).transpose()?.map(|(_, image)| image.color);
-        pictures::rendered(&self.draw(&camera)?, request, recorded.as_ref())
     }
 
     fn control(&self, _: Command) {}

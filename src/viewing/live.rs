@@ -9,14 +9,13 @@ use super::board::{Board, Frames, NumberedImage, put};
 use super::packing::PackedMap;
 use super::path::camera_path;
 use super::pictures::{self, RecordedImages};
-use super::protocol::{
-    CameraView, Command, CurrentView, Hello, KeyframeView, Outgoing, PROTOCOL, Phase, PoseView, RenderRequest, Statistics,
-};
+use super::protocol::{CameraView, Command, CurrentView, Hello, KeyframeView, PROTOCOL, Phase, PoseView, Statistics};
 use super::server::Desk;
 use crate::evaluation::{Alignment, Comparison, evaluate_trajectory, machine};
 use crate::geometry::Trajectory;
 use crate::pipeline::{FrameImage, KeyframePoses, Outlook, Progress, RenderOrder};
 use crate::recording::Recording;
+use crate::render::Rendered;
 use crate::sequence::{RectifiedImage, SensorKind};
 use crate::splat::{MapSnapshot, ViewCamera};
 
@@ -307,25 +306,15 @@ fn frames(poses: Option<&KeyframePoses>) -> Frames {
     Frames { keyframes: views.collect(), loops: poses.loops.clone(), current: None }
 }
 
-impl LiveDesk {
+impl Desk for LiveDesk {
     fn recorded(&self, id: usize) -> Result<(usize, RectifiedImage), String> {
         let frames = self.board.frames.load_full().unwrap_or_default();
         let place = frames.keyframes.binary_search_by_key(&id, |view| view.id).map_err(|_| "there is no such keyframe")?;
         let frame = frames.keyframes[place].frame;
         Ok((frame, self.images.load(&self.recording, frame)?))
     }
-}
 
-impl Desk for LiveDesk {
-    fn keyframe(&self, id: usize) -> Result<Outgoing, String> {
-        let (frame, image) = self.recorded(id)?;
-        pictures::recorded(&image, id, frame)
-    }
-
-    fn render(&self, request: &RenderRequest) -> Result<Outgoing, String> {
-        let (pinhole, world_from_camera) = request.camera().ok_or("a picture has 16 to 1920 pixels along a side, and a pose")?;
-        let camera = ViewCamera { pinhole, camera_from_world: world_from_camera.inverse() };
-        let recorded = request.id.map(|id| self.recorded(id)).transpose()?.map(|(_, image)| image.color);
+    fn draw(&self, camera: &ViewCamera) -> Result<Rendered, String> {
         if self.phase.load(Ordering::Relaxed) == MEASURING {
             return Err("the map is being measured; ask again when that is done".into());
         }
@@ -333,11 +322,10 @@ impl Desk for LiveDesk {
         let reply = Box::new(move |view| {
             let _ = send.send(view);
         });
-        if !self.progress.order(RenderOrder { camera, reply }) {
+        if !self.progress.order(RenderOrder { camera: *camera, reply }) {
             return Err("the mapper has too many pictures to render; ask again".into());
         }
-        let view = receive.recv_timeout(RENDER_TIME).map_err(|_| "the mapper did not render it in time")??;
-        pictures::rendered(&view, request, recorded.as_ref())
+        receive.recv_timeout(RENDER_TIME).map_err(|_| "the mapper did not render it in time")?
     }
 
     fn control(&self, command: Command) {

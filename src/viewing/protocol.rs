@@ -243,7 +243,7 @@ pub enum FromViewer {
     Control { r#do: Command },
 }
 
-/// A picture that a viewer asks for.
+/// A picture that a viewer requests.
 #[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
 #[expect(missing_docs, reason = "docs/view-protocol.md describes all fields")]
 pub struct RenderRequest {

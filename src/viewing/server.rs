@@ -23,7 +23,10 @@ use tokio::time::timeout;
 use super::board::Board;
 use super::error::ViewError;
 use super::protocol::{Command, MOST_FROM_VIEWER, Outgoing, RenderRequest};
-use super::{connection, page};
+use super::{connection, page, pictures};
+use crate::render::Rendered;
+use crate::sequence::RectifiedImage;
+use crate::splat::ViewCamera;
 
 /// Where a view is served unless an address is given.
 pub const DEFAULT_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7007);
@@ -42,22 +45,42 @@ const BLOCKING_THREADS: usize = 2;
 const MOST_ANSWERS: usize = 8;
 const TOKEN_BYTES: usize = 16;
 
-/// What answers the questions of viewers. The calls may block.
+/// What answers requests of viewers. The calls may block.
 pub trait Desk: Send + Sync {
-    /// The recorded image of a keyframe.
+    /// A keyframe's frame and its recorded image, rectified.
     ///
     /// # Errors
     /// Why there is none, for the viewer.
-    fn keyframe(&self, id: usize) -> Result<Outgoing, String>;
+    fn recorded(&self, id: usize) -> Result<(usize, RectifiedImage), String>;
 
-    /// A picture of the map.
+    /// The map, rendered.
     ///
     /// # Errors
-    /// Why there is none, for the viewer.
-    fn render(&self, request: &RenderRequest) -> Result<Outgoing, String>;
+    /// Why it is not, for the viewer.
+    fn draw(&self, camera: &ViewCamera) -> Result<Rendered, String>;
 
     /// Does what a viewer with control wants.
     fn control(&self, command: Command);
+
+    /// The message of a keyframe's recorded image.
+    ///
+    /// # Errors
+    /// Why there is none, for the viewer.
+    fn keyframe(&self, id: usize) -> Result<Outgoing, String> {
+        let (frame, image) = self.recorded(id)?;
+        pictures::recorded(&image, id, frame)
+    }
+
+    /// The message of a picture of the map.
+    ///
+    /// # Errors
+    /// Why there is none, for the viewer.
+    fn render(&self, request: &RenderRequest) -> Result<Outgoing, String> {
+        let (pinhole, world_from_camera) = request.camera().ok_or("a picture has 16 to 1920 pixels along a side, and a pose")?;
+        let camera = ViewCamera { pinhole, camera_from_world: world_from_camera.inverse() };
+        let recorded = request.id.map(|id| self.recorded(id)).transpose()?.map(|(_, image)| image.color);
+        pictures::rendered(&self.draw(&camera)?, request, recorded.as_ref())
+    }
 }
 
 /// Where and for whom a view is served.

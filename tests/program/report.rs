@@ -2,11 +2,11 @@
 //! where there is none.
 
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
+use std::process::Command;
 use std::sync::OnceLock;
 
+use crate::common::browser::chromium;
 use crate::common::recording::{finish, keysplat, recording, run_command, scratch, skipped_without_adapter};
-use crate::common::requirements::skip;
 
 /// A finished run with its report.
 fn report() -> &'static Path {
@@ -103,12 +103,7 @@ fn chromium_shows_it_on_a_phone_and_on_a_desk_by_day_and_by_night() {
     if skipped_without_adapter() {
         return;
     }
-    let Some(chromium) = ["chromium", "chromium-browser", "google-chrome"].into_iter().find(|name| {
-        Command::new(name).arg("--version").stdout(Stdio::null()).stderr(Stdio::null()).status().is_ok_and(|s| s.success())
-    }) else {
-        skip("browser", "there is no chromium");
-        return;
-    };
+    let Some(chromium) = chromium() else { return };
     let page = scratch().join("probed.html");
     std::fs::write(&page, std::fs::read_to_string(report()).unwrap().replace("</body>", PROBE)).unwrap();
     for (width, dark) in [(390, false), (390, true), (1400, false), (1400, true)] {

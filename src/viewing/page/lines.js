@@ -74,7 +74,7 @@ export class Lines {
     this.key = "";
   }
 
-  // Gathers segments anew where what they show has changed. `layers` tells which are on; `chosen` and `marked` name keyframes.
+  // Gathers segments anew where what they show has changed. `layers` has which are on; `chosen` and `marked` name keyframes.
   update(scene, store, layers, chosen, marked) {
     const key = [scene.revision, store.gaussians > 0, chosen, marked ? [...marked].join() : "", ...Object.values(layers)].join(";");
     if (key === this.key) {

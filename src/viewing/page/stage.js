@@ -139,7 +139,7 @@ export class Stage {
     if (!done) {
       return;
     }
-    // A frame with new lines alone tells nothing.
+    // A frame with new lines alone is no measure.
     if (this.blended) {
       this.blended = false;
       this.tookMs = performance.now() - this.began;
