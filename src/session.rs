@@ -1,10 +1,12 @@
 //! A run from its beginning to its metrics: open, run, write, measure. The one entry for the command line, viewers and bindings.
 
+mod dataset;
 mod evaluate;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+pub use dataset::{DatasetCounts, DatasetOptions, DatasetViews, export_dataset};
 pub use evaluate::{EvaluateOptions, evaluate_folder};
 
 use crate::config::Config;
@@ -85,6 +87,12 @@ pub enum SessionError {
     /// A folder to evaluate that does not name its recording.
     #[error("{folder} has no config.toml that names its recording; name it with --sequence")]
     UnnamedRecording {
+        /// The folder.
+        folder: PathBuf,
+    },
+    /// A folder for a dataset that holds something already.
+    #[error("{folder} is not empty; give a new folder, or empty it")]
+    NotEmpty {
         /// The folder.
         folder: PathBuf,
     },

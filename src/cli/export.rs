@@ -1,26 +1,38 @@
-//! `keysplat export`: a map in another file format, whole or in part.
+//! `keysplat export`: a map in another file format, whole or in part; a run's images and poses for other programs.
+
+mod target;
 
 use std::path::{Path, PathBuf};
 
 use clap::Args;
 use glam::Vec3;
+use keysplat::export::dataset::DatasetFormat;
 use keysplat::export::{ExportFilter, MapFormat, fit_harmonics};
+use keysplat::files::write_atomically;
 use keysplat::geometry::{Se3, Trajectory};
 use keysplat::run_folder::outputs;
+use keysplat::session::{DatasetCounts, DatasetOptions, DatasetViews, export_dataset};
 use keysplat::splat::ShDegree;
 use miette::{IntoDiagnostic, miette};
+use target::Target;
 
-use super::{Verbosity, print};
+use super::{Verbosity, print, progress};
 
 #[derive(Args)]
 pub struct ExportArgs {
-    /// Folder of a run, or a map.
+    /// Folder of a run, or, for a map in another format, a map.
     map: PathBuf,
-    /// File to write; its ending is the format: .ply, .spz or .glb.
+    /// File to write; its ending is the format: .ply, .spz or .glb. For a dataset, a new folder.
     out: PathBuf,
     /// Format, where the ending does not say it.
     #[arg(long, value_enum)]
-    format: Option<MapFormat>,
+    format: Option<Target>,
+    /// Images of a dataset.
+    #[arg(long, value_enum, default_value_t = DatasetViews::Keyframes)]
+    views: DatasetViews,
+    /// The recording, where it has moved; its images are part of a dataset.
+    #[arg(long)]
+    sequence: Option<PathBuf>,
     /// Most Gaussians: those that cover most are kept.
     #[arg(long)]
     max_gaussians: Option<usize>,
@@ -55,6 +67,13 @@ fn parse_box(text: &str) -> Result<(Vec3, Vec3), String> {
     if low.cmple(high).all() { Ok((low, high)) } else { Err(wrong()) }
 }
 
+impl ExportArgs {
+    fn filter(&self) -> ExportFilter {
+        let Self { crop, min_opacity, max_gaussians, sh_degree, .. } = *self;
+        ExportFilter { crop, min_opacity, max_gaussians, sh_degree }
+    }
+}
+
 /// The map of a run's folder, or of a file.
 fn find(path: &Path) -> miette::Result<(PathBuf, MapFormat)> {
     let found =
@@ -71,16 +90,25 @@ fn cameras(path: &Path) -> Vec<Se3> {
 }
 
 pub fn export(args: &ExportArgs, verbosity: Verbosity) -> miette::Result<()> {
+    let to = args.format.or_else(|| Target::of_path(&args.out));
+    let unknown =
+        || miette!("{} does not say its format; end it in .ply, .spz or .glb, or name one with --format", args.out.display());
+    let done = match to.ok_or_else(unknown)? {
+        Target::Map(format) => export_map(args, format)?,
+        Target::Dataset(format) => export_images(args, format, verbosity)?,
+        Target::Kitti => export_poses(args)?,
+    };
+    if verbosity.quiet { Ok(()) } else { print(&format!("{done}\n")) }
+}
+
+fn export_map(args: &ExportArgs, to: MapFormat) -> miette::Result<String> {
     let (path, from) = find(&args.map)?;
-    let to = args.format.or_else(|| MapFormat::of_path(&args.out));
-    let to = to.ok_or_else(|| miette!("{} does not say its format; end it in .ply, .spz or .glb", args.out.display()))?;
     let same = |path: &Path| std::fs::canonicalize(path).ok();
     if same(&args.out).is_some_and(|out| Some(out) == same(&path)) {
         return Err(miette!("{} is the map that is exported; choose another file", path.display()));
     }
-    let ExportArgs { max_gaussians, min_opacity, sh_degree, crop, .. } = *args;
     let cloud = from.read(&path).into_diagnostic()?;
-    let part = ExportFilter { crop, min_opacity, max_gaussians, sh_degree }.apply(&cloud);
+    let part = args.filter().apply(&cloud);
     if part.is_empty() {
         return Err(miette!("of {} Gaussians, none passes; widen --crop or lower --min-opacity", cloud.len()));
     }
@@ -89,10 +117,27 @@ pub fn export(args: &ExportArgs, verbosity: Verbosity) -> miette::Result<()> {
         None => part,
     };
     let bytes = to.write(&part, &args.out).into_diagnostic()?.len();
-    if verbosity.quiet {
-        return Ok(());
-    }
-    print(&format!("{}: {} Gaussians, {:.1} MiB\n", args.out.display(), part.len(), bytes as f64 / f64::from(1 << 20)))
+    Ok(format!("{}: {} Gaussians, {:.1} MiB", args.out.display(), part.len(), bytes as f64 / f64::from(1 << 20)))
+}
+
+/// A dataset of the run's images; `transforms.json` may be named instead of its folder.
+fn export_images(args: &ExportArgs, format: DatasetFormat, verbosity: Verbosity) -> miette::Result<String> {
+    let is_named = format == DatasetFormat::Transforms && Target::of_path(&args.out) == Some(Target::Dataset(format));
+    let folder = if is_named { args.out.parent().unwrap_or(Path::new("")) } else { &args.out };
+    let folder = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
+    let options = DatasetOptions { format, views: args.views, points: args.filter(), sequence: args.sequence.clone() };
+    let bar = progress::spinner(verbosity, "{spinner} {pos} images");
+    let counts = export_dataset(&args.map, folder, &options, &|images| bar.set_position(images as u64));
+    bar.finish_and_clear();
+    let DatasetCounts { images, points, unreadable } = counts.into_diagnostic()?;
+    let left_out = if unreadable > 0 { format!(", {unreadable} left out that cannot be read") } else { String::new() };
+    Ok(format!("{}: {images} images{left_out}, {points} points", folder.display()))
+}
+
+fn export_poses(args: &ExportArgs) -> miette::Result<String> {
+    let trajectory = Trajectory::read_tum(&args.map.join(outputs::TRAJECTORY)).into_diagnostic()?;
+    write_atomically(&args.out, trajectory.to_kitti().as_bytes()).into_diagnostic()?;
+    Ok(format!("{}: {} poses, one a line, without those of lost frames", args.out.display(), trajectory.poses.len()))
 }
 
 #[cfg(test)]

@@ -3,6 +3,7 @@
 //! Adding a format takes one file and one row in `FORMATS`. Trajectories are written by [`crate::geometry::Trajectory`].
 
 mod axes;
+pub mod dataset;
 mod filter;
 mod glb;
 mod harmonics;

@@ -140,6 +140,16 @@ impl Trajectory {
         text
     }
 
+    /// The KITTI odometry text: twelve numbers a line, the rows of the 3×4 matrix camera to world, without times.
+    pub fn to_kitti(&self) -> String {
+        let line = |pose: &StampedPose| {
+            let matrix = pose.world_from_camera.to_matrix();
+            let rows = matrix.fixed_rows::<3>(0).transpose();
+            rows.iter().map(|value| format!("{value:.9e}")).collect::<Vec<_>>().join(" ") + "\n"
+        };
+        self.poses.iter().map(line).collect()
+    }
+
     /// Writes the TUM text to `path`.
     ///
     /// # Errors

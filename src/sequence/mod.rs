@@ -237,6 +237,12 @@ impl Sequence {
         self.video.is_none()
     }
 
+    /// The file whose image is frame `index` as a pinhole sees it. None for videos, raw stereo pairs, and cameras with distortion.
+    pub fn plain_image(&self, index: usize) -> Option<&Path> {
+        let is_plain = self.video.is_none() && self.remap.is_none() && self.camera_of(index).distortion.is_zero();
+        is_plain.then_some(&self.entries[index].color)
+    }
+
     /// Whether all frames have one camera.
     pub fn has_one_camera(&self) -> bool {
         self.entries.iter().all(|entry| entry.camera.is_none())

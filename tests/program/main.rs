@@ -5,6 +5,7 @@ mod common;
 
 mod bad_input;
 mod check;
+mod datasets;
 mod end_to_end;
 mod export;
 mod faults;
