@@ -80,9 +80,7 @@ fn collect(progress: &Progress, done: &AtomicBool) -> Vec<MapSnapshot> {
 }
 
 fn on_gpu(gpu: &Arc<Gpu>, snapshot: &MapSnapshot) -> Result<GpuCloud, Box<dyn Error>> {
-    let mut map = GpuCloud::new(gpu, snapshot.cloud.sh_degree, snapshot.cloud.len())?;
-    map.append(gpu, &snapshot.cloud)?;
-    Ok(map)
+    Ok(GpuCloud::of(gpu, &snapshot.cloud)?)
 }
 
 /// Recorded left, map right.

@@ -58,10 +58,11 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
     let side = select(-apart, apart, child % 2u == 1u);
     let offset = side * axis_in_world(averages[2u * setup.capacity + i], longest);
     let divided = vec4(position.xyz + offset, log(each / (1.0 - each)));
-    let scale = vec4(log_scale.xyz, 0.0);
     parameters[i] = divided;
     averages[i] = divided;
-    parameters[setup.capacity + i] = scale;
-    averages[setup.capacity + i] = scale;
+    parameters[setup.capacity + i] = log_scale;
+    averages[setup.capacity + i] = log_scale;
+    // Their averages begin anew.
+    averages[3u * setup.capacity + i].w = 0.0;
     histories[i] = vec4(0.0, 0.0, 0.0, setup.round);
 }

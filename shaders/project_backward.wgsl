@@ -35,7 +35,7 @@ fn backward(i: u32) {
         return;
     }
     let mean_opacity = parameters[i];
-    let log_scale = parameters[view.capacity + i].xyz;
+    let log_scale = parameters[view.capacity + i];
     let rotation = parameters[2u * view.capacity + i];
     let inverse_norm = inverseSqrt(dot(rotation, rotation));
     let unit_rotation = rotation * inverse_norm;
@@ -51,9 +51,15 @@ fn backward(i: u32) {
     let g_0 = symmetric(by_inverse, p_0);
     let g_1 = symmetric(by_inverse, p_1);
     let g_2 = symmetric(by_inverse, p_2);
-    let by_image_0 = -2.0 * inverse_covariance(projection, g_0);
-    let by_image_1 = -2.0 * inverse_covariance(projection, g_1);
-    let by_image_2 = -2.0 * inverse_covariance(projection, g_2);
+    // The compensation's logarithm is that of the determinants without and with the dilation, halved: by t, Σ₀⁻¹t - Σ⁻¹t.
+    let is_compensated = projection.sharp_determinant > LEAST_UNDILUTED * projection.determinant;
+    let by_compensation = select(0.0, view.antialiased * first.x, is_compensated);
+    let s_0 = by_compensation * (inverse_sharp_covariance(projection, projection.image_axis_0) - p_0);
+    let s_1 = by_compensation * (inverse_sharp_covariance(projection, projection.image_axis_1) - p_1);
+    let s_2 = by_compensation * (inverse_sharp_covariance(projection, projection.image_axis_2) - p_2);
+    let by_image_0 = s_0 - 2.0 * inverse_covariance(projection, g_0);
+    let by_image_1 = s_1 - 2.0 * inverse_covariance(projection, g_1);
+    let by_image_2 = s_2 - 2.0 * inverse_covariance(projection, g_2);
 
     // T = J·M: gradients by J's rows, and by M's columns.
     let axes = projection.axes_in_camera;
@@ -63,14 +69,17 @@ fn backward(i: u32) {
     let by_axis_1 = projection.jacobian_x * by_image_1.x + projection.jacobian_y * by_image_1.y;
     let by_axis_2 = projection.jacobian_x * by_image_2.x + projection.jacobian_y * by_image_2.y;
 
-    begin_gradient(i);
+    // The least distance between two samples of the surface, where the map is antialiased.
+    begin_gradient(i, view.antialiased * projection.p_in_camera.z / max(view.intrinsics.x, view.intrinsics.y));
     let by_point = point_gradient(projection, by_mean_2d, color_depth.w, by_jacobian_x, by_jacobian_y);
     let by_mean_of_color = color_gradient(i, mean_opacity.xyz, color_depth.xyz);
     let opacity = sigmoid(mean_opacity.w);
     let by_mean = rotate_to_world(view, by_point) + by_mean_of_color;
     store_gradient(0u, i, vec4(by_mean, (1.0 - opacity) * first.x));
-    store_gradient(1u, i, -2.0 * vec4(dot(p_0, g_0), dot(p_1, g_1), dot(p_2, g_2), 0.0));
-    let scale = exp(log_scale);
+    let by_smoothed = vec3(dot(projection.image_axis_0, s_0), dot(projection.image_axis_1, s_1), dot(projection.image_axis_2, s_2))
+        - 2.0 * vec3(dot(p_0, g_0), dot(p_1, g_1), dot(p_2, g_2));
+    store_gradient(1u, i, vec4(projection.kept * by_smoothed + (1.0 - projection.kept) * first.x, 0.0));
+    let scale = projection.scale;
     let by_rotation_matrix = mat3x3(
         rotate_to_world(view, by_axis_0) * scale.x,
         rotate_to_world(view, by_axis_1) * scale.y,

@@ -54,16 +54,20 @@ fn project(i: u32) -> bool {
     if !(norm_squared >= MIN_QUATERNION_NORM_SQUARED) {
         return false;
     }
-    let log_scale = parameters[view.capacity + i].xyz;
+    let log_scale = parameters[view.capacity + i];
     let projection = project_gaussian(view, mean_opacity.xyz, log_scale, rotation * inverseSqrt(norm_squared));
     let c = projection.covariance;
     if !(projection.determinant >= MIN_DETERMINANT && projection.determinant < MAX_DETERMINANT) {
         return false;
     }
+    let seen_opacity = opacity * projection.compensation;
+    if !(seen_opacity >= ALPHA_MIN) {
+        return false;
+    }
     let p = projection.p_in_camera;
     let mean = view.intrinsics.xy * p.xy / p.z + view.intrinsics.zw;
     // -log(alpha) grows by ½dᵀΣ⁻¹d; alpha reaches ALPHA_MIN where that equals the cut.
-    let cut = log(opacity / ALPHA_MIN);
+    let cut = log(seen_opacity / ALPHA_MIN);
     let half_extent = sqrt(2.0 * cut * c.xz);
     let inside = (mean + half_extent >= vec2(-0.5)) & (mean - half_extent <= vec2(f32(view.width), f32(view.height)) - 0.5);
     if !all(inside) {
@@ -74,7 +78,7 @@ fn project(i: u32) -> bool {
         return false;
     }
     projected[3u * i] = vec4(mean, depth, cut);
-    projected[3u * i + 1u] = vec4(conic_factor(projection), opacity);
+    projected[3u * i + 1u] = vec4(conic_factor(projection), seen_opacity);
     projected[3u * i + 2u] = vec4(seen, bitcast<f32>(pack2x16float(min(half_extent * EXTENT_SLACK, vec2(MAX_EXTENT)))));
     return true;
 }

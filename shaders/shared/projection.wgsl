@@ -1,6 +1,9 @@
 // EWA projection of one Gaussian (Zwicker et al. 2001; Kerbl et al. 2023), shared by the forward and the backward pass.
 //
 // With N = R(q)·diag(s) the world covariance is N·Nᵀ. M = R_camera·N and T = J·M give the image covariance T·Tᵀ + dilation.
+//
+// An antialiased map has the two filters of Mip-Splatting (Yu et al. 2024). In space, s² grows by the square of SMOOTHING sampling intervals. In the image, the
+// opacity shrinks as the dilation spreads the Gaussian. Without them the factors are 1, to the bit.
 
 struct Projection {
     p_in_camera: vec3<f32>,
@@ -18,7 +21,17 @@ struct Projection {
     image_axis_2: vec2<f32>,
     // 1 where x/z (y/z) was inside its bounds, 0 where clamped.
     inside: vec2<f32>,
+    // Standard deviations after the smoothing, metres, and the share of their squares that they had before it.
+    scale: vec3<f32>,
+    kept: vec3<f32>,
+    // Determinant without the dilation.
+    sharp_determinant: f32,
+    // Factor of the opacity.
+    compensation: f32,
 }
+
+// Logarithm of the smallest scale whose smoothing is told from that of a point.
+const LEAST_LOG_SCALE: f32 = -30.0;
 
 fn rotation_matrix(q: vec4<f32>) -> mat3x3<f32> {
     // q = (w, x, y, z) of unit length.
@@ -31,10 +44,15 @@ fn rotation_matrix(q: vec4<f32>) -> mat3x3<f32> {
     );
 }
 
-fn project_gaussian(view_: View, mean: vec3<f32>, log_scale: vec3<f32>, unit_rotation: vec4<f32>) -> Projection {
+// Lane w of the log scale is the sampling interval, metres; 0 smooths nothing.
+fn project_gaussian(view_: View, mean: vec3<f32>, log_scale: vec4<f32>, unit_rotation: vec4<f32>) -> Projection {
     var out: Projection;
     let p = rotate_to_camera(view_, mean) + translation(view_);
-    let scale = exp(log_scale);
+    let smoothing = SMOOTHING * log_scale.w * exp(-max(log_scale.xyz, vec3(LEAST_LOG_SCALE)));
+    let growth = 1.0 + smoothing * smoothing;
+    let scale = exp(log_scale.xyz) * sqrt(growth);
+    out.scale = scale;
+    out.kept = 1.0 / growth;
     let axes = rotation_matrix(unit_rotation);
     out.p_in_camera = p;
     out.axes_in_camera = mat3x3(
@@ -53,7 +71,10 @@ fn project_gaussian(view_: View, mean: vec3<f32>, log_scale: vec3<f32>, unit_rot
     out.covariance = vec3(dot(row_x, row_x) + DILATION, dot(row_x, row_y), dot(row_y, row_y) + DILATION);
     // |x|²|y|² - (x·y)² = |x×y|²: without this a needle's determinant drowns in rounding.
     let area = cross(row_x, row_y);
-    out.determinant = dot(area, area) + DILATION * (out.covariance.x + out.covariance.z - DILATION);
+    out.sharp_determinant = dot(area, area);
+    out.determinant = out.sharp_determinant + DILATION * (out.covariance.x + out.covariance.z - DILATION);
+    let undiluted = sqrt(max(out.sharp_determinant / out.determinant, LEAST_UNDILUTED));
+    out.compensation = sqrt(out.kept.x * out.kept.y * out.kept.z) * mix(1.0, undiluted, view_.antialiased);
     out.image_axis_0 = vec2(row_x.x, row_y.x);
     out.image_axis_1 = vec2(row_x.y, row_y.y);
     out.image_axis_2 = vec2(row_x.z, row_y.z);
@@ -72,6 +93,12 @@ fn conic_factor(p: Projection) -> vec3<f32> {
 fn inverse_covariance(p: Projection, v: vec2<f32>) -> vec2<f32> {
     let sum = across(p.image_axis_0, v) + across(p.image_axis_1, v) + across(p.image_axis_2, v);
     return (DILATION * v + sum) / p.determinant;
+}
+
+// The same without the dilation, where that leaves more than the least opacity.
+fn inverse_sharp_covariance(p: Projection, v: vec2<f32>) -> vec2<f32> {
+    let sum = across(p.image_axis_0, v) + across(p.image_axis_1, v) + across(p.image_axis_2, v);
+    return sum / max(p.sharp_determinant, LEAST_UNDILUTED * DILATION * DILATION);
 }
 
 // The part of v across the axis t, times |t|².

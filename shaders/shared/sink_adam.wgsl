@@ -29,7 +29,7 @@ const AVERAGED_PART: f32 = 4.0;
 @group(0) @binding(6) var<storage, read_write> moments_2: array<vec4<f32>>;
 @group(0) @binding(7) var<uniform> adam: AdamSetup;
 // The parameters over each Gaussian's last steps, on average: where successive views pull to and fro, it stays in between. Lane w of plane
-// 1 counts the steps.
+// 3 counts the steps. Lane w of plane 1 is the sampling interval in parameters and averages both, metres: the least of all views so far.
 @group(0) @binding(8) var<storage, read_write> averages: array<vec4<f32>>;
 
 // Bias corrections 1/(1 - βⁿ) of the first and the second moments after this step: of all planes, and of the higher harmonics.
@@ -42,13 +42,17 @@ var<private> share: f32;
 // Geometric mean of the standard deviations, metres.
 var<private> size: f32;
 
-// Lane w of planes 1 and 3 is free; in the first moments these count the Gaussian's steps, of all and of its higher harmonics.
-fn begin_gradient(i: u32) {
+// This view's sampling interval at the Gaussian, metres; 0 where the map is not antialiased.
+var<private> sampling_interval: f32;
+
+// In the first moments, lane w of planes 1 and 3 counts the Gaussian's steps, of all and of its higher harmonics.
+fn begin_gradient(i: u32, interval: f32) {
+    sampling_interval = interval;
     let log_scale = parameters[view.capacity + i];
     size = min(exp((log_scale.x + log_scale.y + log_scale.z) / 3.0), 1e3);
     corrections = count_step(view.capacity + i);
     color_pace = inverseSqrt(1.0 + moments_1[view.capacity + i].w * adam.color_settling);
-    share = max(1.0 / (1.0 + averages[view.capacity + i].w / AVERAGED_PART), adam.least_share);
+    share = max(1.0 / (1.0 + averages[3u * view.capacity + i].w / AVERAGED_PART), adam.least_share);
     if wants_harmonics() {
         corrections_of_harmonics = count_step(3u * view.capacity + i);
     }
@@ -58,6 +62,10 @@ fn count_step(at: u32) -> vec2<f32> {
     let steps = moments_1[at].w + 1.0;
     moments_1[at].w = steps;
     return 1.0 / (1.0 - exp(steps * vec2(adam.log_beta_1, adam.log_beta_2)));
+}
+
+fn least_interval(before: f32) -> f32 {
+    return select(min(before, sampling_interval), sampling_interval, before == 0.0);
 }
 
 // The length never decides; see `coefficient_count`.
@@ -70,7 +78,7 @@ fn blunt(log_scale: vec4<f32>) -> vec4<f32> {
     let longest = max(max(log_scale.x, log_scale.y), log_scale.z);
     let shortest = min(min(log_scale.x, log_scale.y), log_scale.z);
     let second = log_scale.x + log_scale.y + log_scale.z - longest - shortest;
-    return vec4(min(log_scale.xyz, vec3(second + adam.log_elongation)), log_scale.w);
+    return vec4(min(log_scale.xyz, vec3(second + adam.log_elongation)), least_interval(log_scale.w));
 }
 
 fn store_gradient(plane: u32, i: u32, raw: vec4<f32>) {
@@ -88,7 +96,7 @@ fn store_gradient(plane: u32, i: u32, raw: vec4<f32>) {
     parameters[at] = now;
     let average = averages[at];
     let mean = mix(average, now, share);
-    averages[at] = select(mean, vec4(blunt(mean).xyz, average.w + 1.0), plane == 1u);
+    averages[at] = select(vec4(mean.xyz, select(mean.w, average.w + 1.0, plane == 3u)), vec4(blunt(mean).xyz, now.w), plane == 1u);
     moments_1[at] = select(m, vec4(m.xyz, before.w), plane == 1u || plane == 3u);
     moments_2[at] = v;
 }

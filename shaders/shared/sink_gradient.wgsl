@@ -2,7 +2,7 @@
 @group(0) @binding(4) var<storage, read> parameters: array<vec4<f32>>;
 @group(0) @binding(5) var<storage, read_write> gradients: array<vec4<f32>>;
 
-fn begin_gradient(i: u32) {}
+fn begin_gradient(i: u32, interval: f32) {}
 
 fn wants_harmonics() -> bool {
     return true;

@@ -22,6 +22,8 @@ struct View {
     capacity: u32,
     sh_degree: u32,
     intersection_capacity: u32,
+    // 1 where the map is antialiased: opacities are compensated for the dilation; else 0.
+    antialiased: f32,
 }
 
 // Workgroups beyond 65,535 are laid out in further rows of as many.

@@ -43,8 +43,7 @@ impl BenchScene {
         for _ in 0..count {
             cloud.push(gaussian(&mut rng, &pinhole, count, sh_degree));
         }
-        let mut on_gpu = GpuCloud::new(gpu, sh_degree, count)?;
-        on_gpu.append(gpu, &cloud)?;
+        let on_gpu = GpuCloud::of(gpu, &cloud)?;
         let color = RgbImage::from_fn(width, height, |x, y| Rgb([(x * 7 + y) as u8, (y * 5) as u8, (x + y * 3) as u8]));
         let target = TargetImage::new(gpu, &color, Some(&vec![2.0; (width * height) as usize]))?;
         Ok(Self { cloud: on_gpu, camera: ViewCamera { pinhole, camera_from_world: Se3::identity() }, target })
@@ -61,8 +60,7 @@ impl BenchScene {
         color: &RgbImage,
         depth_metres: Option<&[f32]>,
     ) -> Result<Self, GpuError> {
-        let mut on_gpu = GpuCloud::new(gpu, cloud.sh_degree, cloud.len())?;
-        on_gpu.append(gpu, cloud)?;
+        let on_gpu = GpuCloud::of(gpu, cloud)?;
         let target = TargetImage::new(gpu, color, depth_metres)?;
         Ok(Self { cloud: on_gpu, camera, target })
     }

@@ -62,8 +62,7 @@ pub fn render(args: &RenderArgs, verbosity: Verbosity) -> miette::Result<()> {
         return Err(miette!("{} has no poses", args.dir.join(outputs::TRAJECTORY).display()));
     }
     let gpu = Gpu::open(args.adapter.as_deref()).into_diagnostic()?;
-    let mut on_gpu = GpuCloud::new(&gpu, cloud.sh_degree, cloud.len()).into_diagnostic()?;
-    on_gpu.append(&gpu, &cloud).into_diagnostic()?;
+    let on_gpu = GpuCloud::of(&gpu, &cloud).into_diagnostic()?;
     let mut rasterizer = Rasterizer::new(gpu).into_diagnostic()?;
     let mut film = Film::create(&args.out, (pinhole.width, pinhole.height), fps).into_diagnostic()?;
     let bar = progress::bar(verbosity, poses.len() as u64, "{wide_bar} {pos}/{len} frames");

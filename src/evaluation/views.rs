@@ -142,8 +142,7 @@ pub fn evaluate_views(
     let ViewSource { sequence, map_scale, gpu, cloud } = source;
     let mut rectifiers = Rectifiers::new(map_scale);
     let mut rasterizer = Rasterizer::new(gpu.clone())?;
-    let mut on_gpu = GpuCloud::new(gpu, cloud.sh_degree, cloud.len())?;
-    on_gpu.append(gpu, cloud)?;
+    let on_gpu = GpuCloud::of(gpu, cloud)?;
     let mut means = ProtocolMeans::default();
     for (batch, poses) in selection.poses.chunks(BATCH).enumerate() {
         on_view(batch * BATCH);

@@ -31,7 +31,7 @@ impl ExportFilter {
             kept.sort_unstable();
         }
         let degree = self.sh_degree.map_or(cloud.sh_degree, |degree| degree.min(cloud.sh_degree));
-        let mut part = GaussianCloud::new(degree);
+        let mut part = GaussianCloud { sh_degree: degree, ..cloud.emptied() };
         kept.into_iter().for_each(|i| part.push(cloud.get(i)));
         part
     }

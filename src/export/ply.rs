@@ -24,6 +24,8 @@ pub(super) const FORMAT: FormatRow = FormatRow {
     decode,
 };
 
+/// The comment that splat-transform, Brush and their like keep of an antialiased map.
+const ANTIALIASED: &str = "comment SplatRenderMode: mip";
 /// No honest header is longer; a file that has no line ends must not be read whole in search of one.
 const MAX_HEADER_BYTES: u64 = 1 << 16;
 
@@ -46,7 +48,8 @@ fn encode(cloud: &GaussianCloud) -> Result<Vec<u8>, ExportError> {
         return Err(ExportError::NonFinite { index });
     }
     let names = property_names(cloud.sh_degree);
-    let mut header = format!("ply\nformat binary_little_endian 1.0\nelement vertex {}\n", cloud.len());
+    let comment = if cloud.antialiased { format!("{ANTIALIASED}\n") } else { String::new() };
+    let mut header = format!("ply\nformat binary_little_endian 1.0\n{comment}element vertex {}\n", cloud.len());
     for name in &names {
         header.push_str(&format!("property float {name}\n"));
     }
@@ -96,7 +99,8 @@ fn decode(reader: &mut dyn BufRead, FileSize(file_bytes): FileSize, path: &Path)
     let length_error = || ExportError::Length { path: path.into(), vertices: layout.vertices, stride: layout.stride, found };
     let vertices = usize::try_from(layout.vertices).ok().filter(|_| fits).ok_or_else(length_error)?;
 
-    let mut cloud = GaussianCloud::new(layout.sh_degree);
+    let antialiased = lines.iter().any(|line| line == ANTIALIASED);
+    let mut cloud = GaussianCloud { antialiased, ..GaussianCloud::new(layout.sh_degree) };
     let mut vertex = vec![0u8; layout.stride];
     let mut values = vec![0.0f32; layout.offsets.len()];
     for index in 0..vertices {

@@ -28,6 +28,8 @@ pub(super) const FORMAT: FormatRow = FormatRow {
 
 const MAGIC: u32 = 0x5053_474e;
 const VERSION: u32 = 3;
+/// Flag of maps whose opacities are compensated for the pixel's dilation.
+const ANTIALIASED: u8 = 1;
 const HEADER: usize = 16;
 /// Positions are fixed-point numbers of 24 bits, of which usually so many are behind the point.
 const FRACTIONAL_BITS: i32 = 12;
@@ -65,7 +67,7 @@ fn encode(cloud: &GaussianCloud) -> Result<Vec<u8>, ExportError> {
     bytes.extend(MAGIC.to_le_bytes());
     bytes.extend(VERSION.to_le_bytes());
     bytes.extend((cloud.len() as u32).to_le_bytes());
-    bytes.extend([cloud.sh_degree.get(), bits as u8, 0, 0]);
+    bytes.extend([cloud.sh_degree.get(), bits as u8, if cloud.antialiased { ANTIALIASED } else { 0 }, 0]);
     let byte = |value: f32| value.round().clamp(0.0, 255.0) as u8;
     for coordinate in cloud.means.iter().flat_map(|mean| mean.to_array()) {
         let most = (1 << (POSITION_BITS - 1)) - 1;
@@ -155,7 +157,8 @@ fn decode(reader: &mut dyn BufRead, FileSize(file_bytes): FileSize, path: &Path)
     if bytes.len() as u64 != expected {
         return Err(cut());
     }
-    Ok(turned(&unpack(&bytes, count as usize, version, degree, bits)))
+    let cloud = unpack(&bytes, count as usize, version, degree, bits);
+    Ok(GaussianCloud { antialiased: header[14] & ANTIALIASED != 0, ..turned(&cloud) })
 }
 
 /// The Gaussians of the attributes, which are as long as they should be.

@@ -12,6 +12,8 @@ use crate::splat::ShDegree;
 pub struct MappingConfig {
     /// Degree of the spherical harmonics: 0 has no view dependence.
     pub sh_degree: ShDegree,
+    /// Whether the map has Mip-Splatting's filters, for views from much nearer or farther than the keyframes.
+    pub antialiased: bool,
     /// Optimisation steps over the window after each keyframe, one view each. Most steps gain more in consolidation.
     pub iterations_per_keyframe: usize,
     /// Steps after the first keyframe, which has no map to start from.
@@ -47,6 +49,7 @@ impl Default for MappingConfig {
     fn default() -> Self {
         Self {
             sh_degree: ShDegree::new(2).expect("degrees 0 to 3 exist"),
+            antialiased: false,
             iterations_per_keyframe: 5,
             first_iterations: 50,
             yields_to_keyframes: false,

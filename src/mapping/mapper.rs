@@ -95,7 +95,7 @@ impl Mapper {
         Ok(Self {
             config: Arc::new(config.clone()),
             trainer: Trainer::new(gpu.clone())?,
-            cloud: GpuCloud::new(&gpu, config.sh_degree, FIRST_CAPACITY)?,
+            cloud: GpuCloud::new(&gpu, config.sh_degree, FIRST_CAPACITY)?.with_antialiasing(config.antialiased),
             anchors: Anchors::default(),
             density: DensityPasses::new(&gpu)?,
             keyframes: Vec::new(),

@@ -35,11 +35,12 @@ pub struct GaussianHistory {
     pub came: f32,
 }
 
-/// Gaussians on the GPU, `[planes, capacity]` vec4 in each buffer. Plane 0 holds position and raw opacity, 1 the log scale,
-/// 2 the rotation (w, x, y, z), 3 the constant colour, 4… the other harmonics, RGB each.
+/// Gaussians on the GPU, `[planes, capacity]` vec4 in each buffer. Plane 0 holds position and raw opacity, 1 the log scale and the
+/// sampling interval, 2 the rotation (w, x, y, z), 3 the constant colour, 4… the other harmonics, RGB each.
 #[derive(Debug)]
 pub struct GpuCloud {
     sh_degree: ShDegree,
+    antialiased: bool,
     count: usize,
     capacity: usize,
     /// The most that there may be, if that is limited.
@@ -87,6 +88,7 @@ impl GpuCloud {
         let planes = || allocate(gpu, sh_degree, capacity);
         Ok(Self {
             sh_degree,
+            antialiased: false,
             count: 0,
             capacity,
             limit: None,
@@ -102,6 +104,27 @@ impl GpuCloud {
             kernels: Kernels::new(gpu),
             uniforms: Uniforms::new(gpu)?,
         })
+    }
+
+    /// A map as it is, to be rendered. Gaussians that hold a NaN or an infinity are left out.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
+    pub fn of(gpu: &Gpu, map: &GaussianCloud) -> Result<Self, GpuError> {
+        let mut cloud = Self::new(gpu, map.sh_degree, map.len())?;
+        cloud.antialiased = map.antialiased;
+        cloud.append(gpu, map)?;
+        Ok(cloud)
+    }
+
+    /// With the filters of Mip-Splatting, or without: see [`GaussianCloud::antialiased`].
+    pub fn with_antialiasing(self, antialiased: bool) -> Self {
+        Self { antialiased, ..self }
+    }
+
+    /// Whether it has the filters of Mip-Splatting.
+    pub fn is_antialiased(&self) -> bool {
+        self.antialiased
     }
 
     /// Number of Gaussians.
@@ -230,12 +253,28 @@ impl GpuCloud {
         Ok(cloud_from_planes(self.sh_degree, &planes))
     }
 
-    /// Reads the whole map as it is shown.
+    /// The least distance of two samples at each Gaussian so far, `[N]` metres; 0 before the first step that moved it.
+    ///
+    /// # Errors
+    /// [`GpuError`] if the device fails.
+    pub fn sampling_intervals(&self, gpu: &Gpu) -> Result<Vec<f32>, GpuError> {
+        let scales: Vec<[f32; 4]> = self.averages.read(gpu, self.capacity, self.count)?;
+        Ok(scales.iter().map(|scale| scale[3]).collect())
+    }
+
+    /// Reads the whole map as it is shown, with its smoothing applied.
     ///
     /// # Errors
     /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn download(&self, gpu: &Gpu) -> Result<GaussianCloud, GpuError> {
-        self.read_planes(gpu, &self.averages)
+        let read = gpu.read(None, &self.parts(&self.averages).collect::<Vec<_>>())?;
+        let planes: Vec<Vec<[f32; 4]>> = (0..self.planes()).map(|plane| read.part(plane)).collect();
+        let mut cloud = cloud_from_planes(self.sh_degree, &planes);
+        if self.antialiased {
+            cloud.antialiased = true;
+            cloud.smooth(planes[1].iter().map(|scale| scale[3]));
+        }
+        Ok(cloud)
     }
 
     /// All that training needs to go on as if it had never stopped.
@@ -285,6 +324,7 @@ fn cloud_from_planes(sh_degree: ShDegree, read: &[Vec<[f32; 4]>]) -> GaussianClo
     let coefficients = &read[GEOMETRY_PLANES..];
     GaussianCloud {
         sh_degree,
+        antialiased: false,
         means: read[0].iter().map(xyz).collect(),
         raw_opacities: read[0].iter().map(|v| v[3]).collect(),
         log_scales: read[1].iter().map(xyz).collect(),

@@ -54,7 +54,7 @@ pub const VERDICT_BITS: u32 = 15;
 /// Bit of a parent in a list of changes: its children are of its own size.
 pub const DIVIDED_BY_CLONING: u32 = 1 << 31;
 
-/// Planes of vec4 that precede the higher harmonics: (position, raw opacity), (log scale, -), rotation (w, x, y, z), (constant colour, -).
+/// Planes of vec4 that precede the higher harmonics: (position, raw opacity), (log scale, sampling interval), rotation (w, x, y, z), (constant colour, -).
 pub const GEOMETRY_PLANES: usize = 3;
 
 /// How a tile's pixels are spread over invocations. Both forms give the same result up to rounding; each is the faster one on its kind
@@ -149,6 +149,8 @@ pub fn wgsl_constants(form: BlendForm) -> String {
         ("NEAR_METRES", NEAR_METRES),
         ("FAR_METRES", FAR_METRES),
         ("DILATION", DILATION),
+        ("SMOOTHING", SMOOTHING),
+        ("LEAST_UNDILUTED", LEAST_UNDILUTED),
         ("MIN_DETERMINANT", MIN_DETERMINANT),
         ("BRIGHTNESS_STEP", f64::from(BRIGHTNESS_STEP)),
         ("MIN_QUATERNION_NORM_SQUARED", MIN_QUATERNION_NORM_SQUARED),
@@ -207,6 +209,8 @@ impl View {
             capacity: 0,
             sh_degree: 0,
             intersection_capacity: 0,
+            antialiased: 0.0,
+            pad: [0; 3],
         }
     }
 

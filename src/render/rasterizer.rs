@@ -190,6 +190,7 @@ impl Rasterizer {
         // All per-Gaussian buffers of the workspace are at least as long as the map's planes, whose stride both share.
         view.capacity = cloud.capacity() as u32;
         view.sh_degree = u32::from(cloud.sh_degree().get());
+        view.antialiased = f32::from(u8::from(cloud.is_antialiased()));
         view.intersection_capacity = self.workspace.intersection_capacity as u32;
         let uniform = self.uniforms.put(&view);
         Ok(PreparedView { view, uniform, sorted: Self::sorted(view.tiles()) })

@@ -18,6 +18,9 @@ pub use sh::ShDegree;
 pub struct GaussianCloud {
     /// Degree of the spherical harmonics.
     pub sh_degree: ShDegree,
+    /// Whether opacities are those of Gaussians without the pixel's dilation and shrink with it: the 2D filter of Mip-Splatting (Yu et al.
+    /// 2024), with 3DGS' width.
+    pub antialiased: bool,
     /// `[N, 3]` world, metres.
     pub means: Vec<Vec3>,
     /// `[N, 3]` natural logarithm of the standard deviations along the Gaussian's own axes, metres.
@@ -51,6 +54,25 @@ impl GaussianCloud {
         Self { sh_degree, ..Self::default() }
     }
 
+    /// An empty map of the same kind.
+    pub fn emptied(&self) -> Self {
+        Self { sh_degree: self.sh_degree, antialiased: self.antialiased, ..Self::default() }
+    }
+
+    /// Convolves each Gaussian with an isotropic one of `SMOOTHING` times its sampling interval, metres; opacities shrink as volumes grow: the
+    /// 3D filter of Mip-Splatting. An interval of 0 changes nothing.
+    pub fn smooth(&mut self, intervals: impl IntoIterator<Item = f32>) {
+        for (i, interval) in intervals.into_iter().enumerate().filter(|(_, interval)| *interval > 0.0) {
+            let radius = model::SMOOTHING * f64::from(interval);
+            let growth = self.log_scales[i].to_array().map(|log_scale| 1.0 + (radius * (-f64::from(log_scale)).exp()).powi(2));
+            self.log_scales[i] += Vec3::from(growth.map(|growth| (0.5 * growth.ln()) as f32));
+            let kept = growth.iter().product::<f64>().sqrt().recip();
+            let raw_opacity = f64::from(self.raw_opacities[i]);
+            let opacity = kept / (1.0 + (-raw_opacity).exp());
+            self.raw_opacities[i] = (opacity / (1.0 - opacity)).ln().max(f64::from(f32::MIN)) as f32;
+        }
+    }
+
     /// Number of Gaussians.
     pub fn len(&self) -> usize {
         self.means.len()
@@ -63,7 +85,7 @@ impl GaussianCloud {
 
     /// At most `count` of its Gaussians, spread evenly over it.
     pub fn thinned(&self, count: usize) -> Self {
-        let mut cloud = Self::new(self.sh_degree);
+        let mut cloud = self.emptied();
         let count = count.min(self.len());
         (0..count).for_each(|i| cloud.push(self.get(i * self.len() / count)));
         cloud
@@ -98,7 +120,7 @@ impl GaussianCloud {
 
     /// Its Gaussians without those that hold a NaN or an infinity.
     pub fn finite(&self) -> Self {
-        let mut cloud = Self::new(self.sh_degree);
+        let mut cloud = self.emptied();
         (0..self.len()).filter(|&i| self.is_finite(i)).for_each(|i| cloud.push(self.get(i)));
         cloud
     }

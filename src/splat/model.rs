@@ -17,6 +17,10 @@ pub const NEAR_METRES: f64 = 0.05;
 pub const FAR_METRES: f64 = 1e5;
 /// Added to the image covariance's diagonal, pixels²: the footprint of a pixel (3DGS).
 pub const DILATION: f64 = 0.3;
+/// Standard deviation of the smoothing of an antialiased map in sampling intervals: √0.2 (Mip-Splatting, Yu et al. 2024).
+pub const SMOOTHING: f64 = 0.447_213_595_499_957_94;
+/// Least square of the factor by which an antialiased map's opacities shrink in the image.
+pub const LEAST_UNDILUTED: f64 = 2.5e-5;
 /// Least determinant of an image covariance, pixels⁴.
 pub const MIN_DETERMINANT: f64 = 1e-6;
 /// Least squared norm of a rotation.

@@ -175,6 +175,7 @@ impl Delivery {
             complete,
             gaussians: map.gaussians,
             sh_degree: map.sh_degree.get(),
+            antialiased: map.antialiased,
             cell: map.cell_metres(),
             chunks: removed.chain(chosen.iter().map(|part| chunk(&part))).collect(),
         };

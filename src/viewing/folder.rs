@@ -229,8 +229,7 @@ fn json<T: DeserializeOwned>(folder: &Path, name: &str) -> Option<T> {
 impl FolderDesk {
     fn open_renderer(&self) -> Result<Renderer, GpuError> {
         let gpu = Gpu::open(self.adapter.as_deref())?;
-        let mut cloud = GpuCloud::new(&gpu, self.cloud.sh_degree, self.cloud.len())?;
-        cloud.append(&gpu, &self.cloud)?;
+        let cloud = GpuCloud::of(&gpu, &self.cloud)?;
         Ok(Renderer { rasterizer: Rasterizer::new(gpu)?, cloud })
     }
 }

@@ -51,6 +51,8 @@ pub struct PackedMap {
     pub revision: u64,
     /// Degree of the harmonics.
     pub sh_degree: ShDegree,
+    /// See [`GaussianCloud::antialiased`].
+    pub antialiased: bool,
     /// Exponent of two of the grid's width in metres.
     pub width: i32,
     /// Gaussians of all parts.
@@ -77,7 +79,7 @@ impl PackedMap {
         });
         let parts: Vec<Arc<Part>> = parts.collect();
         let gaussians = parts.iter().map(|part| part.count).sum();
-        Self { revision, sh_degree: cloud.sh_degree, width, gaussians, parts }
+        Self { revision, sh_degree: cloud.sh_degree, antialiased: cloud.antialiased, width, gaussians, parts }
     }
 
     /// Width of a cell, metres.

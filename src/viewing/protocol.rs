@@ -193,6 +193,7 @@ pub struct MapHeader {
     pub complete: bool,
     pub gaussians: usize,
     pub sh_degree: u8,
+    pub antialiased: bool,
     pub cell: f64,
     pub chunks: Vec<ChunkHeader>,
 }

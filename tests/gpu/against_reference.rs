@@ -12,7 +12,8 @@ use keysplat::splat::{Exposure, GaussianCloud, ShDegree, ViewCamera};
 use keysplat::verification::reference::adam::{Adam64, Decay64};
 use keysplat::verification::reference::loss::{LossWeights, Target64, loss};
 use keysplat::verification::reference::project_backward::backward;
-use keysplat::verification::reference::{Cutoffs, Gaussian64, Image64, View64, cloud64, rasterize_forward};
+use keysplat::verification::reference::smoothing::{smooth, smooth_backward};
+use keysplat::verification::reference::{Cutoffs, Gaussian64, Image64, ImageGradient64, View64, cloud64, rasterize_forward};
 use nalgebra::Vector3;
 use std::sync::Arc;
 
@@ -21,14 +22,14 @@ const IMAGE_TOLERANCE: f64 = 1e-4;
 const GRADIENT_TOLERANCE: f64 = 1e-3;
 const BACKGROUND: [f32; 3] = [0.2, 0.5, 0.1];
 
-fn view64(camera: &ViewCamera) -> View64 {
+fn view64(camera: &ViewCamera, cloud: &GaussianCloud) -> View64 {
     let background = Vector3::from(BACKGROUND).map(f64::from);
-    View64 { camera: *camera, background, cutoffs: Cutoffs::Sharp }
+    View64 { camera: *camera, background, cutoffs: Cutoffs::Sharp, antialiased: cloud.antialiased }
 }
 
 pub fn upload(gpu: &Gpu, cloud: &GaussianCloud) -> GpuCloud {
-    let mut on_gpu = GpuCloud::new(gpu, cloud.sh_degree, cloud.len()).unwrap();
-    assert_eq!(on_gpu.append(gpu, cloud).unwrap(), 0);
+    let on_gpu = GpuCloud::of(gpu, cloud).unwrap();
+    assert_eq!(on_gpu.len(), cloud.len());
     on_gpu
 }
 
@@ -43,7 +44,7 @@ fn both_forms(gpu: &Arc<Gpu>) -> impl Iterator<Item = Trainer> {
 
 /// Renders on both and compares the images; returns the oracle's.
 fn compare_images(gpu: &Arc<Gpu>, cloud: &GaussianCloud, camera: &ViewCamera) -> Image64 {
-    let expected = rasterize_forward::render(&view64(camera), &cloud64(cloud));
+    let expected = rasterize_forward::render(&view64(camera, cloud), &cloud64(cloud));
     let colors = expected.color.iter().zip(&expected.depth).flat_map(|(c, d)| [c.x, c.y, c.z, *d]);
     let wanted: Vec<f64> = colors.chain(expected.transmittance.iter().copied()).collect();
     for mut trainer in both_forms(gpu) {
@@ -55,15 +56,18 @@ fn compare_images(gpu: &Arc<Gpu>, cloud: &GaussianCloud, camera: &ViewCamera) ->
     expected
 }
 
+fn image_gradients(by_image: &ImageGradient64) -> ImageGradients {
+    let color_depth =
+        by_image.color.iter().zip(&by_image.depth).map(|(c, d)| [c.x as f32, c.y as f32, c.z as f32, *d as f32]).collect();
+    ImageGradients { color_depth, alpha: by_image.alpha.iter().map(|a| *a as f32).collect() }
+}
+
 /// Pushes the same image gradient back on both and compares.
 fn compare_gradients(gpu: &Arc<Gpu>, cloud: &GaussianCloud, camera: &ViewCamera, rng: &mut Rng) {
     let pixels = (camera.pinhole.width * camera.pinhole.height) as usize;
     let by_image = crate::common::image_gradient(rng, pixels);
-    let color_depth =
-        by_image.color.iter().zip(&by_image.depth).map(|(c, d)| [c.x as f32, c.y as f32, c.z as f32, *d as f32]).collect();
-    let alpha = by_image.alpha.iter().map(|a| *a as f32).collect();
-    let by = ImageGradients { color_depth, alpha };
-    let expected = backward(&view64(camera), &cloud64(cloud), &by_image);
+    let by = image_gradients(&by_image);
+    let expected = backward(&view64(camera, cloud), &cloud64(cloud), &by_image);
     let wanted = flat(&expected);
     for mut trainer in both_forms(gpu) {
         let form = trainer.form();
@@ -83,9 +87,75 @@ fn random_scenes_agree() {
     for seed in 0..8 {
         let mut rng = Rng::with_seed(seed);
         let camera = crate::common::camera(&mut rng, 61, 45);
-        let cloud = crate::common::scene(&mut rng, 300, ShDegree::ALL[(seed % 4) as usize]);
+        let mut cloud = crate::common::scene(&mut rng, 300, ShDegree::ALL[(seed % 4) as usize]);
         compare_images(&gpu, &cloud, &camera);
         compare_gradients(&gpu, &cloud, &camera, &mut rng);
+        cloud.antialiased = true;
+        // Of a pixel's size, and needles: what the compensation is for.
+        (0..cloud.len()).for_each(|i| cloud.log_scales[i] -= glam::Vec3::new((i % 3) as f32, (i % 2) as f32, 1.0));
+        compare_images(&gpu, &cloud, &camera);
+        compare_gradients(&gpu, &cloud, &camera, &mut rng);
+    }
+}
+
+/// The sampling interval of the nearest view that moved a Gaussian smooths it, in what is rendered, learned and downloaded.
+#[test]
+fn smoothing_by_sampling_intervals_agrees() {
+    let Some(gpu) = adapter() else { return };
+    for degree in [ShDegree::ALL[0], ShDegree::ALL[2]] {
+        let mut rng = Rng::with_seed(30);
+        let camera = crate::common::camera(&mut rng, 61, 45);
+        let mut cloud = crate::common::scene(&mut rng, 300, degree);
+        cloud.antialiased = true;
+        (0..cloud.len()).for_each(|i| cloud.log_scales[i] -= glam::Vec3::new((i % 3) as f32, (i % 2) as f32, 1.0));
+        let (image, wide) = target(&mut rng, camera.pinhole);
+        let image = upload_target(&gpu, &image, &wide);
+        let mut nearer = camera;
+        nearer.camera_from_world.translation.vector.z -= 0.3;
+        let still = AdamConfig { max_elongation: 1e6, ..AdamConfig::default().scaled(0.0, 0.0) };
+        for mut trainer in both_forms(&gpu) {
+            let on_gpu = upload(&gpu, &cloud);
+            let mut learn = |trainer: &mut Trainer, camera: &ViewCamera| {
+                let views = [TrainingView::new(*camera, &image)];
+                trainer.steps(&on_gpu, &views, &LossConfig::default(), &still).unwrap();
+                on_gpu.sampling_intervals(&gpu).unwrap()
+            };
+            let depth = |camera: &ViewCamera, i: usize| {
+                let mean = nalgebra::Point3::from(cloud.means[i].to_array().map(f64::from));
+                (camera.camera_from_world * mean).z / camera.pinhole.fx.max(camera.pinhole.fy)
+            };
+            let first = learn(&mut trainer, &camera);
+            let is_of =
+                |camera: &ViewCamera, i: usize, interval: f32| (f64::from(interval) / depth(camera, i) - 1.0).abs() < 1e-4;
+            assert!((0..cloud.len()).all(|i| first[i] == 0.0 || is_of(&camera, i, first[i])));
+            assert!(first.iter().filter(|interval| **interval > 0.0).count() > cloud.len() / 2);
+            let second = learn(&mut trainer, &nearer);
+            assert!((0..cloud.len()).all(|i| second[i] == first[i] || is_of(&nearer, i, second[i])));
+            assert!((0..cloud.len()).all(|i| first[i] == 0.0 || second[i] <= first[i]) && second != first);
+            let intervals = learn(&mut trainer, &camera);
+            assert_eq!(intervals, second, "a view from further away changes nothing");
+
+            let gaussians = cloud64(&cloud);
+            let pairs = || gaussians.iter().zip(intervals.iter().map(|interval| f64::from(*interval)));
+            let smoothed: Vec<Gaussian64> = pairs().map(|(g, interval)| smooth(g, interval)).collect();
+            let downloaded = on_gpu.download(&gpu).unwrap();
+            let error = crate::common::relative_error(&flat(&cloud64(&downloaded)), &flat(&smoothed));
+            assert!(downloaded.antialiased && error < 1e-6, "download: {error:e}");
+            compare_images(&gpu, &downloaded, &camera);
+            let rendered = trainer.render(&on_gpu, &camera, BACKGROUND).unwrap();
+            let baked = trainer.render(&upload(&gpu, &downloaded), &camera, BACKGROUND).unwrap();
+            let row = |rendered: &[[f32; 4]]| rendered.iter().flatten().map(|v| f64::from(*v)).collect::<Vec<f64>>();
+            assert!(crate::common::relative_error(&row(&rendered.color_depth), &row(&baked.color_depth)) < IMAGE_TOLERANCE);
+
+            let by_image = crate::common::image_gradient(&mut rng, 61 * 45);
+            let by = image_gradients(&by_image);
+            let by_smoothed = backward(&view64(&camera, &cloud), &smoothed, &by_image);
+            let wanted: Vec<Gaussian64> =
+                pairs().zip(&by_smoothed).map(|((g, interval), by)| smooth_backward(g, interval, by)).collect();
+            let got = trainer.gradients_from_image(&on_gpu, &camera, BACKGROUND, &by).unwrap();
+            let error = crate::common::relative_error(&flat(&cloud64(&got.cloud)), &flat(&wanted));
+            assert!(error < GRADIENT_TOLERANCE, "gradient, {:?}: {error:e}", trainer.form());
+        }
     }
 }
 
@@ -128,7 +198,7 @@ fn the_loss_and_its_whole_gradient_agree() {
         let views = vec![TrainingView::new(camera, &image); steps];
         trainer.steps(&on_gpu, &views, &config, &still).unwrap();
         let got = trainer.gradients(&on_gpu, &camera, &image, &config).unwrap();
-        let view = View64 { background: Vector3::zeros(), ..view64(&camera) };
+        let view = View64 { background: Vector3::zeros(), ..view64(&camera, &cloud) };
         let rendered = rasterize_forward::render(&view, &cloud64(&cloud));
         let weights = LossWeights {
             ssim: f64::from(config.ssim_weight),
@@ -224,6 +294,9 @@ fn hazards_stay_finite_and_right() {
         eprintln!("hazard: {name}");
         let expected = compare_images(&gpu, &cloud, &camera);
         assert!(expected.transmittance.iter().any(|t| *t < 0.9), "the scene was not seen");
+        compare_gradients(&gpu, &cloud, &camera, &mut rng);
+        cloud.antialiased = true;
+        compare_images(&gpu, &cloud, &camera);
         compare_gradients(&gpu, &cloud, &camera, &mut rng);
     }
 }

@@ -30,8 +30,7 @@ fn a_step_on_the_programs_own_device_moves_the_map() {
     let mut rng = Rng::with_seed(3);
     let camera = crate::common::camera(&mut rng, 48, 32);
     let cloud = crate::common::scene(&mut rng, 60, ShDegree::default());
-    let mut on_gpu = GpuCloud::new(&gpu, cloud.sh_degree, cloud.len()).unwrap();
-    on_gpu.append(&gpu, &cloud).unwrap();
+    let on_gpu = GpuCloud::of(&gpu, &cloud).unwrap();
     let target = TargetImage::new(&gpu, &RgbImage::from_pixel(48, 32, image::Rgb([90, 120, 60])), None).unwrap();
     let mut trainer = Trainer::new(Arc::clone(&gpu)).unwrap();
     let (loss, adam) = (LossConfig::default(), AdamConfig::default());

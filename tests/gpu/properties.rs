@@ -77,7 +77,7 @@ fn scene(seed: u64, faults: &[(u8, f32)]) -> (View64, GaussianCloud) {
         spoil(&mut gaussian, *fault, *strength);
         cloud.push(gaussian);
     }
-    (View64 { camera, background: Vector3::new(0.1, 0.2, 0.3), cutoffs: Cutoffs::Sharp }, cloud)
+    (View64 { camera, background: Vector3::new(0.1, 0.2, 0.3), cutoffs: Cutoffs::Sharp, antialiased: false }, cloud)
 }
 
 fn narrow(v: &Vector3<f64>) -> [f32; 3] {

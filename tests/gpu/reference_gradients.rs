@@ -6,6 +6,7 @@ use keysplat::splat::ShDegree;
 use keysplat::verification::reference::loss::{LossWeights, Target64, loss};
 use keysplat::verification::reference::project_backward::backward;
 use keysplat::verification::reference::rasterize_forward::render;
+use keysplat::verification::reference::smoothing::{smooth, smooth_backward};
 use keysplat::verification::reference::{Cutoffs, Gaussian64, Image64, View64, cloud64};
 use nalgebra::Vector3;
 
@@ -23,7 +24,34 @@ fn difference(a: &[f64], b: &[f64]) -> f64 {
 }
 
 fn view(rng: &mut Rng) -> View64 {
-    View64 { camera: crate::common::camera(rng, 12, 9), background: Vector3::new(0.2, 0.5, 0.1), cutoffs: Cutoffs::Smooth }
+    View64 {
+        camera: crate::common::camera(rng, 12, 9),
+        background: Vector3::new(0.2, 0.5, 0.1),
+        cutoffs: Cutoffs::Smooth,
+        antialiased: false,
+    }
+}
+
+/// Compares `gradient` with central differences of the loss by every number of every Gaussian.
+fn check(cloud: &[Gaussian64], gradient: &[Gaussian64], loss: &dyn Fn(&[Gaussian64]) -> f64) {
+    let mut compared = 0.0;
+    for i in 0..cloud.len() {
+        let derivative = |k: usize| {
+            let shifted = |by: f64| {
+                let mut moved = cloud.to_vec();
+                let mut row = moved[i].flat();
+                row[k] += by;
+                moved[i] = Gaussian64::from_flat(&row);
+                loss(&moved)
+            };
+            (shifted(STEP) - shifted(-STEP)) / (2.0 * STEP)
+        };
+        let numeric: Vec<f64> = (0..cloud[i].flat().len()).map(derivative).collect();
+        let own = gradient[i].flat();
+        assert!(difference(&own, &numeric) < TOLERANCE * norm(&own) + NOISE, "Gaussian {i}: {own:?} {numeric:?}");
+        compared += norm(&own);
+    }
+    assert!(compared > 0.1, "the scene was hardly seen");
 }
 
 #[test]
@@ -33,30 +61,16 @@ fn parameter_gradients_are_central_differences() {
         let view = view(&mut rng);
         let cloud = cloud64(&crate::common::scene(&mut rng, 6, degree));
         let by_image = crate::common::image_gradient(&mut rng, 12 * 9);
-        let gradient = backward(&view, &cloud, &by_image);
-        let loss = |cloud: &[Gaussian64]| crate::common::linear_loss(&render(&view, cloud), &by_image);
-        let mut compared = 0.0;
-        for i in 0..cloud.len() {
-            let numeric: Vec<f64> = (0..cloud[i].flat().len())
-                .map(|k| {
-                    let shifted = |by: f64| {
-                        let mut moved = cloud.clone();
-                        let mut row = moved[i].flat();
-                        row[k] += by;
-                        moved[i] = Gaussian64::from_flat(&row);
-                        loss(&moved)
-                    };
-                    (shifted(STEP) - shifted(-STEP)) / (2.0 * STEP)
-                })
-                .collect();
-            let own = gradient[i].flat();
-            assert!(
-                difference(&own, &numeric) < TOLERANCE * norm(&own) + NOISE,
-                "degree {degree:?}, Gaussian {i}: {own:?} {numeric:?}"
-            );
-            compared += norm(&own);
-        }
-        assert!(compared > 1.0, "the scene was hardly seen");
+        let loss = |view: &View64, cloud: &[Gaussian64]| crate::common::linear_loss(&render(view, cloud), &by_image);
+        check(&cloud, &backward(&view, &cloud, &by_image), &|cloud| loss(&view, cloud));
+
+        let antialiased = View64 { antialiased: true, ..view };
+        check(&cloud, &backward(&antialiased, &cloud, &by_image), &|cloud| loss(&antialiased, cloud));
+        let interval = |i: usize| 0.02 * i as f64;
+        let smoothed = |cloud: &[Gaussian64]| cloud.iter().enumerate().map(|(i, g)| smooth(g, interval(i))).collect::<Vec<_>>();
+        let by_smoothed = backward(&antialiased, &smoothed(&cloud), &by_image);
+        let gradient = cloud.iter().zip(&by_smoothed).enumerate().map(|(i, (g, by))| smooth_backward(g, interval(i), by));
+        check(&cloud, &gradient.collect::<Vec<_>>(), &|cloud| loss(&antialiased, &smoothed(cloud)));
     }
 }
 

@@ -25,7 +25,7 @@ fn scores_are_those_of_their_definition() {
         let (width, height) = (camera.pinhole.width, camera.pinhole.height);
         let image = RgbImage::from_fn(width, height, |_, _| Rgb([rng.u8(..), rng.u8(..), rng.u8(..)]));
 
-        let view = View64 { camera, background: Vector3::zeros(), cutoffs: Cutoffs::Sharp };
+        let view = View64 { camera, background: Vector3::zeros(), cutoffs: Cutoffs::Sharp, antialiased: false };
         let cloud_64 = cloud64(&cloud);
         let rendered = rasterize_forward::render(&view, &cloud_64);
         let color: Vec<Vector3<f64>> = image.pixels().map(|p| Vector3::from(p.0.map(|c| f64::from(c) / 255.0))).collect();

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use keysplat::export::MapFormat;
-use keysplat::splat::ShDegree;
+use keysplat::splat::{GaussianCloud, ShDegree};
 
 use crate::common::recording::{Finished, finish, keysplat, scratch};
 
@@ -29,6 +29,13 @@ fn a_map_goes_through_every_format_and_back() {
         let back = MapFormat::default().read(&back).unwrap();
         assert_eq!((back.len(), back.sh_degree), (300, map.sh_degree), "{format:?}");
         assert!(back.means.iter().zip(&map.means).all(|(a, b)| a.distance(*b) < 2e-3), "{format:?}");
+    }
+    let antialiased = GaussianCloud { antialiased: true, ..map.clone() };
+    MapFormat::default().write(&antialiased, &ply).unwrap();
+    for ending in ["ply", "spz"] {
+        let file = scratch().join("antialiased").with_extension(ending);
+        export(&folder, &file, &[]).succeeded();
+        assert!(MapFormat::of_path(&file).unwrap().read(&file).unwrap().antialiased, "{ending}");
     }
     let part = scratch().join("part");
     export(&ply, &part, &["--format", "spz", "--max-gaussians", "40", "--sh-degree", "0", "--min-opacity", "0.1"]).succeeded();

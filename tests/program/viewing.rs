@@ -217,8 +217,7 @@ fn a_browser_draws_the_map_as_we_do() {
     let pinhole = recording.map_pinhole();
     let keyframes = Trajectory::read_tum(&out.join("keyframes.txt")).unwrap().poses;
     let gpu = Gpu::open(None).unwrap();
-    let mut map = GpuCloud::new(&gpu, cloud.sh_degree, cloud.len()).unwrap();
-    map.append(&gpu, &cloud).unwrap();
+    let map = GpuCloud::of(&gpu, &cloud).unwrap();
     let mut rasterizer = Rasterizer::new(gpu).unwrap();
     let report = format!("file://{}", std::fs::canonicalize(out.join("report.html")).unwrap().display());
     for (address, width, height, dark) in [(serving.url.as_str(), 1400, 900, false), (&report, 390, 844, true)] {

@@ -52,7 +52,8 @@ impl Mapper {
     /// [`MappingError`] if a buffer does not fit or the device fails.
     pub fn restore(gpu: Arc<Gpu>, config: &MappingConfig, state: &MapperState) -> Result<Self, MappingError> {
         let mut mapper = Self::new(gpu, config)?;
-        mapper.cloud = GpuCloud::restore(&mapper.gpu, config.sh_degree, &state.cloud)?.ok_or(MappingError::State)?;
+        let cloud = GpuCloud::restore(&mapper.gpu, config.sh_degree, &state.cloud)?.ok_or(MappingError::State)?;
+        mapper.cloud = cloud.with_antialiasing(config.antialiased);
         if state.anchors.len() != mapper.cloud.len() {
             return Err(MappingError::State);
         }

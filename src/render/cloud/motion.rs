@@ -64,6 +64,7 @@ fn move_geometry(planes: &mut [Vec<[f32; 4]>], run: Range<usize>, new_from_old: 
         let p = new_from_old.act(&Point3::new(x, y, z).cast());
         planes[0][i] = [p.x as f32, p.y as f32, p.z as f32, raw_opacity];
         planes[1][i][..3].iter_mut().for_each(|log_scale| *log_scale += growth);
+        planes[1][i][3] *= new_from_old.scale as f32;
         let [w, x, y, z] = planes[2][i];
         let q = turn * Quat::from_xyzw(x, y, z, w);
         planes[2][i] = [q.w, q.x, q.y, q.z];

@@ -54,6 +54,10 @@ host_twins! {
         sh_degree: u32,
         /// Tile intersections that the buffers have space for.
         intersection_capacity: u32,
+        /// 1 where the map is antialiased, else 0.
+        antialiased: f32,
+        /// Unused.
+        pad: [u32; 3],
     }
     /// Counts made on the GPU, and the indirect dispatches that follow from them (`shaders/shared/counters.wgsl`).
     #[derive(Default)]

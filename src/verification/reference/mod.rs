@@ -9,6 +9,7 @@ pub mod project_forward;
 pub mod rasterize_backward;
 pub mod rasterize_forward;
 pub mod scores;
+pub mod smoothing;
 pub mod spherical_harmonics;
 
 use nalgebra::{Vector2, Vector3, Vector4};
@@ -98,6 +99,8 @@ pub struct View64 {
     pub background: Vector3<f64>,
     /// Whether the rasterizer's discontinuities are kept.
     pub cutoffs: Cutoffs,
+    /// Whether the map is antialiased.
+    pub antialiased: bool,
 }
 
 /// A rendered image, `[H * W]` each.

@@ -22,7 +22,11 @@ fn project_backward(view: &View64, g: &Gaussian64, f: &Projected64, by: &Project
     let rotation = camera_rotation(view);
     // Σ⁻¹ = P: dΣ = -P⁻¹dP P⁻¹, hence ∂L/∂Σ = -P G P with G symmetric.
     let by_conic = Matrix2::new(by.conic.x, by.conic.y / 2.0, by.conic.y / 2.0, by.conic.z);
-    let by_covariance = -(f.conic * by_conic * f.conic);
+    let mut by_covariance = -(f.conic * by_conic * f.conic);
+    // log √(det Σ₀ / det Σ), where Σ is Σ₀ with the dilation.
+    if let Some(sharp_conic) = f.sharp_conic {
+        by_covariance += 0.5 * by.opacity * f.opacity * (sharp_conic - f.conic);
+    }
     let by_t: Matrix2x3<f64> = 2.0 * by_covariance * (f.jacobian * f.axes);
     let by_jacobian = by_t * f.axes.transpose();
     let by_axes: Matrix3<f64> = f.jacobian.transpose() * by_t;
@@ -43,7 +47,7 @@ fn project_backward(view: &View64, g: &Gaussian64, f: &Projected64, by: &Project
         mean: rotation.transpose() * by_point + by_mean_of_color,
         log_scale: Vector3::from_fn(|k, _| by_axes_in_world.column(k).dot(&world_axes.column(k))),
         rotation: (by_unit - q * q.dot(&by_unit)) / g.rotation.norm(),
-        raw_opacity: by.opacity * f.opacity * (1.0 - f.opacity),
+        raw_opacity: by.opacity * f.opacity * (1.0 - f.base_opacity),
         sh: (0..g.sh.len()).map(|k| free * spherical_harmonics::basis(k, &f.direction)).collect(),
     }
 }

@@ -14,8 +14,12 @@ pub struct Projected64 {
     pub depth: f64,
     /// Inverse 2D covariance, 1/pixels².
     pub conic: Matrix2<f64>,
-    /// After the sigmoid, in (0, 1).
+    /// After the sigmoid and the compensation for the dilation, in (0, 1).
     pub opacity: f64,
+    /// The sigmoid alone.
+    pub(super) base_opacity: f64,
+    /// Σ⁻¹ without the dilation, where the opacity depends on it.
+    pub(super) sharp_conic: Option<Matrix2<f64>>,
     /// RGB for the viewing direction, not below zero.
     pub color: Vector3<f64>,
     /// -log(alpha / opacity) up to which a pixel is touched.
@@ -57,12 +61,9 @@ pub fn project(view: &View64, g: &Gaussian64) -> Option<Projected64> {
     let p = &camera.pinhole;
     let rotation = camera_rotation(view);
     let p_in_camera = rotation * g.mean + camera.camera_from_world.translation.vector;
-    let opacity = 1.0 / (1.0 + (-g.raw_opacity).exp());
+    let base_opacity = 1.0 / (1.0 + (-g.raw_opacity).exp());
     let visible_depth = p_in_camera.z > model::NEAR_METRES && p_in_camera.z < model::FAR_METRES;
     if !visible_depth || g.rotation.norm_squared() < model::MIN_QUATERNION_NORM_SQUARED {
-        return None;
-    }
-    if view.cutoffs == Cutoffs::Sharp && opacity < model::ALPHA_MIN {
         return None;
     }
     let axes = rotation * rotation_matrix(&g.rotation.normalize()) * Matrix3::from_diagonal(&g.log_scale.map(f64::exp));
@@ -72,10 +73,18 @@ pub fn project(view: &View64, g: &Gaussian64) -> Option<Projected64> {
     let clamped = Vector2::new(tangent.x.clamp(bounds[0], bounds[1]), tangent.y.clamp(bounds[2], bounds[3]));
     let jacobian = Matrix2x3::new(p.fx / z, 0.0, -p.fx * clamped.x / z, 0.0, p.fy / z, -p.fy * clamped.y / z);
     let t = jacobian * axes;
-    let covariance = t * t.transpose() + Matrix2::identity() * model::DILATION;
+    let sharp = t * t.transpose();
+    let covariance = sharp + Matrix2::identity() * model::DILATION;
     if !(covariance.determinant() >= model::MIN_DETERMINANT && covariance.determinant() < 1e30) {
         return None;
     }
+    let undiluted = sharp.determinant() / covariance.determinant();
+    let compensation = if view.antialiased { undiluted.max(model::LEAST_UNDILUTED).sqrt() } else { 1.0 };
+    let opacity = base_opacity * compensation;
+    if view.cutoffs == Cutoffs::Sharp && opacity < model::ALPHA_MIN {
+        return None;
+    }
+    let is_compensated = view.antialiased && undiluted > model::LEAST_UNDILUTED;
     let offset = g.mean - camera.camera_from_world.inverse().translation.vector;
     let direction = offset.normalize();
     let harmonics = g.sh.iter().enumerate().map(|(k, c)| c * spherical_harmonics::basis(k, &direction));
@@ -85,6 +94,8 @@ pub fn project(view: &View64, g: &Gaussian64) -> Option<Projected64> {
         depth: z,
         conic: covariance.try_inverse()?,
         opacity,
+        base_opacity,
+        sharp_conic: sharp.try_inverse().filter(|_| is_compensated),
         color: unclamped_color.map(|c| c.max(0.0)),
         cut: (opacity / model::ALPHA_MIN).ln(),
         p_in_camera,

@@ -34,8 +34,6 @@ impl Machine {
     }
 
     pub(super) fn upload(&self, cloud: &GaussianCloud) -> Result<GpuCloud, GpuError> {
-        let mut on_gpu = GpuCloud::new(&self.gpu, cloud.sh_degree, cloud.len())?;
-        on_gpu.append(&self.gpu, cloud)?;
-        Ok(on_gpu)
+        GpuCloud::of(&self.gpu, cloud)
     }
 }

@@ -48,7 +48,12 @@ pub fn families(machine: &Machine) -> Vec<Family<'_>> {
 }
 
 fn view64(scene: &Scene) -> View64 {
-    View64 { camera: scene.camera, background: Vector3::from(BACKGROUND).map(f64::from), cutoffs: Cutoffs::Sharp }
+    View64 {
+        camera: scene.camera,
+        background: Vector3::from(BACKGROUND).map(f64::from),
+        cutoffs: Cutoffs::Sharp,
+        antialiased: false,
+    }
 }
 
 /// Largest difference over largest magnitude, of `(got, wanted)`.

@@ -33,6 +33,7 @@ export class MapStore {
     this.version = 0;
     this.lines = 0;
     this.degree = 0;
+    this.antialiased = false;
     this.base = new Uint32Array(0);
     this.harmonics = new Uint32Array(0);
     this.dirty = new Uint8Array(0);
@@ -101,6 +102,7 @@ export class MapStore {
       this.clear();
     }
     this.growDegree(map.sh_degree);
+    this.antialiased = map.antialiased === true;
     let first = 0;
     for (const chunk of map.chunks) {
       this.put(map, chunk, first);

@@ -20,6 +20,8 @@ uniform vec4 intrinsics;
 uniform vec4 bounds;
 uniform vec2 size;
 uniform int degree;
+// 1 where opacities shrink as the dilation spreads a Gaussian, else 0.
+uniform float antialiased;
 // 0: colour, 1: depth, 2: keyframes that see it.
 uniform int shown;
 // First value and inverse width of the range of depths or numbers.
@@ -130,6 +132,10 @@ void main() {
   if (!(determinant >= 1e-6 && determinant < 1e30)) {
     return;
   }
+  opacity *= mix(1.0, sqrt(max(dot(area, area) / determinant, 2.5e-5)), antialiased);
+  if (!(opacity >= ALPHA_MIN)) {
+    return;
+  }
   vec2 at = intrinsics.xy * p.xy / p.z + intrinsics.zw;
   vec2 extent = sqrt(2.0 * log(opacity / ALPHA_MIN) * covariance.xz);
   if (any(lessThan(at + extent, vec2(-0.5))) || any(greaterThan(at - extent, size - 0.5))) {
@@ -139,7 +145,7 @@ void main() {
   vec2 factor = vec2(covariance.z, -covariance.y) * inversesqrt(determinant) * inverse;
   vec3 color = min(paint_of(slot, mean, p.z, two), vec3(60000.0));
   shape = uvec4(floatBitsToUint(at), floatBitsToUint(factor));
-  paint = uvec4(floatBitsToUint(inverse), packHalf2x16(color.rg), (packHalf2x16(vec2(color.b, 0.0)) & 65535u) | (one.w << 16u), 1u);
+  paint = uvec4(floatBitsToUint(inverse), packHalf2x16(color.rg), (packHalf2x16(vec2(color.b, 0.0)) & 65535u) | (uint(opacity * 65535.0 + 0.5) << 16u), 1u);
 }`;
 
 export const PROJECT_FRAGMENT = SHADER_HEAD + PROJECT_HEAD + PROJECT_HARMONICS + PROJECT_MAIN;

@@ -241,6 +241,7 @@ export class SplatRenderer {
     gl.uniform3fv(places.center, view.center);
     gl.uniform4fv(places.bounds, view.bounds);
     gl.uniform1i(places.degree, this.degree);
+    gl.uniform1f(places.antialiased, this.store.antialiased ? 1 : 0);
     gl.uniform1i(places.shown, shown);
     gl.uniform2f(places.range, range[0], 1 / Math.max(range[1] - range[0], 1e-6));
     this.bind(0, this.base, places.base);
