@@ -42,11 +42,19 @@ const MAX_DETERMINANT: f32 = 1e30;
 // Far beyond any picture; a NaN fails the comparison.
 const MAX_COLOR: f32 = 1e6;
 
+// A permutation of 32 bits in which nothing of the order is left (PCG; Jarzynski & Olano 2020).
+fn hash(i: u32) -> u32 {
+    let state = i * 747796405u + 2891336453u;
+    let word = ((state >> ((state >> 28u) + 4u)) ^ state) * 277803737u;
+    return (word >> 22u) ^ word;
+}
+
 fn project(i: u32) -> bool {
     let mean_opacity = parameters[i];
     let depth = dot(view.camera_row_2.xyz, mean_opacity.xyz) + view.camera_row_2.w;
-    let opacity = sigmoid(mean_opacity.w);
-    if !(depth > NEAR_METRES && depth < FAR_METRES && opacity >= ALPHA_MIN) {
+    let opacity = sigmoid(mean_opacity.w) * view.opacity_gain;
+    let is_dropped = hash(i + view.dropout_seed) < view.dropped_below;
+    if !(depth > NEAR_METRES && depth < FAR_METRES && opacity >= ALPHA_MIN && !is_dropped) {
         return false;
     }
     let rotation = parameters[2u * view.capacity + i];

@@ -24,6 +24,10 @@ struct View {
     intersection_capacity: u32,
     // 1 where the map is antialiased: opacities are compensated for the dilation; else 0.
     antialiased: f32,
+    // Dropout: Gaussians whose hash is below this are left out, the opacities of the others grow by the gain. 0 and 1 without it.
+    dropped_below: u32,
+    dropout_seed: u32,
+    opacity_gain: f32,
 }
 
 // Workgroups beyond 65,535 are laid out in further rows of as many.

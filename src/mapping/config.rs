@@ -178,6 +178,8 @@ pub struct RefineConfig {
     pub final_lr_scale_position: f32,
     /// Factor on all other learning rates at the end of the refinement.
     pub final_lr_scale: f32,
+    /// Share of the Gaussians that the last step leaves out, for scenes that few views see; it grows linearly from zero.
+    pub dropout: f32,
 }
 
 impl RefineConfig {
@@ -206,6 +208,7 @@ impl Default for RefineConfig {
             half_size_share: 0.0,
             final_lr_scale_position: 0.02,
             final_lr_scale: 0.2,
+            dropout: 0.0,
         }
     }
 }
@@ -269,6 +272,7 @@ impl MappingConfig {
             ("insertion.opacity", s.opacity),
             ("insertion.detail", s.detail),
             ("points.opacity", self.points.opacity),
+            ("refine.dropout", self.refine.dropout),
         ];
         if let Some((name, value)) = shares.iter().find(|(_, value)| !(0.0..1.0).contains(value)) {
             return Err(format!("mapping.{name} must lie between 0 and 1, not {value}"));

@@ -5,6 +5,7 @@ use fastrand::Rng;
 use super::WindowConfig;
 use super::keyframe::MappedKeyframe;
 use crate::optimise::ErrorPixels;
+use crate::splat::model::Dropout;
 
 /// Training view of a step.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -12,13 +13,15 @@ pub(super) struct Step {
     pub keyframe: usize,
     /// At half the size.
     pub coarse: bool,
+    /// Gaussians that it leaves out.
+    pub dropout: Dropout,
     /// Whether the step also scores the Gaussians.
     pub scored: Option<ErrorPixels>,
 }
 
 impl Step {
     pub fn new(keyframe: usize) -> Self {
-        Self { keyframe, coarse: false, scored: None }
+        Self { keyframe, coarse: false, dropout: Dropout::default(), scored: None }
     }
 }
 

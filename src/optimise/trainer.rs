@@ -16,8 +16,9 @@ use super::scores::{ErrorPixels, GaussianScore, OverScores, ScoredImage, Scores}
 use super::survey::SurveyPass;
 use super::{AdamConfig, LossConfig, LossTerms, Pixels, TargetImage};
 use crate::gpu::{Gpu, GpuBuffer, GpuError};
-use crate::render::layout::StepLog;
+use crate::render::layout::{StepLog, View};
 use crate::render::{BlendForm, GpuCloud, Rasterizer, Rendered, ViewCounts};
+use crate::splat::model::Dropout;
 use crate::splat::{Exposure, ViewCamera};
 
 /// What a step did.
@@ -44,13 +45,15 @@ pub struct TrainingView<'a> {
     pub depth_confidence: f32,
     /// Exposure of the target against the map's.
     pub exposure: Exposure,
+    /// Gaussians that the step leaves out.
+    pub dropout: Dropout,
 }
 
 impl<'a> TrainingView<'a> {
     /// The whole view at full learning rates and in the map's exposure, not scored.
     pub fn new(camera: ViewCamera, target: &'a TargetImage) -> Self {
-        let exposure = Exposure::default();
-        Self { camera, target, streamed: None, scored: None, depth_confidence: 1.0, exposure }
+        let (exposure, dropout) = Default::default();
+        Self { camera, target, streamed: None, scored: None, depth_confidence: 1.0, exposure, dropout }
     }
 }
 
@@ -284,7 +287,12 @@ impl Trainer {
         sink: &Sink<'_>,
     ) -> Result<(), GpuError> {
         let gpu = self.rasterizer.gpu().clone();
-        let prepared = self.rasterizer.prepare(cloud, viewpoint.camera, viewpoint.background)?;
+        let dropout = match objective {
+            Objective::Image { view, .. } => view.dropout,
+            Objective::Given => Dropout::default(),
+        };
+        let view = View::new(viewpoint.camera, viewpoint.background).with_dropout(dropout);
+        let prepared = self.rasterizer.prepare_view(cloud, view)?;
         image_buffers::choose(&mut self.images, &gpu, (prepared.view.width, prepared.view.height))?;
         match objective {
             Objective::Image { view, loss, log } => {

@@ -210,8 +210,16 @@ impl View {
             sh_degree: 0,
             intersection_capacity: 0,
             antialiased: 0.0,
-            pad: [0; 3],
+            dropped_below: 0,
+            dropout_seed: 0,
+            opacity_gain: 1.0,
         }
+    }
+
+    /// The same with a dropout.
+    pub fn with_dropout(self, Dropout { share, seed }: Dropout) -> Self {
+        let dropped_below = (f64::from(share) * f64::from(u32::MAX)) as u32;
+        Self { dropped_below, dropout_seed: seed, opacity_gain: 1.0 / (1.0 - share), ..self }
     }
 
     /// Tiles of the image.

@@ -183,7 +183,14 @@ impl Rasterizer {
     /// # Errors
     /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn prepare(&mut self, cloud: &GpuCloud, camera: &ViewCamera, background: [f32; 3]) -> Result<PreparedView, GpuError> {
-        let mut view = View::new(camera, background);
+        self.prepare_view(cloud, View::new(camera, background))
+    }
+
+    /// The same for the constants of a view.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
+    pub fn prepare_view(&mut self, cloud: &GpuCloud, mut view: View) -> Result<PreparedView, GpuError> {
         self.workspace.reserve_gaussians(&self.gpu, cloud.capacity())?;
         self.workspace.reserve_image(&self.gpu, view.pixels(), view.tiles())?;
         view.gaussian_count = cloud.len() as u32;

@@ -37,6 +37,16 @@ pub fn depth_key(depth: f32) -> u32 {
     (depth.to_bits() - (NEAR_METRES as f32).to_bits()) / DEPTH_KEY_STEP
 }
 
+/// Gaussians that a training step leaves out, so that none relies on others that few views see (DropGaussian, Park et al. 2025). The opacities
+/// of the others grow by 1 / (1 - share).
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Dropout {
+    /// Share of the Gaussians that is left out, below 1.
+    pub share: f32,
+    /// Equal seeds leave out the same places of a map.
+    pub seed: u32,
+}
+
 /// A camera to render from.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ViewCamera {

@@ -8,7 +8,8 @@ use keysplat::geometry::Pinhole;
 use keysplat::gpu::Gpu;
 use keysplat::optimise::{AdamConfig, ImageGradients, LossConfig, TargetImage, Trainer, TrainingView, ssim_phase};
 use keysplat::render::{BlendForm, GpuCloud, Rasterizer};
-use keysplat::splat::{Exposure, GaussianCloud, ShDegree, ViewCamera};
+use keysplat::splat::model::Dropout;
+use keysplat::splat::{Exposure, GaussianCloud, ShDegree, ViewCamera, opacity_from_raw, raw_opacity_from_opacity};
 use keysplat::verification::reference::adam::{Adam64, Decay64};
 use keysplat::verification::reference::loss::{LossWeights, Target64, loss};
 use keysplat::verification::reference::project_backward::backward;
@@ -325,6 +326,49 @@ fn non_finite_gaussians_are_refused_or_culled() {
     let with_nan = rasterizer.render(&on_gpu, &camera, BACKGROUND).unwrap();
     assert_eq!(rendered.transmittance.len(), with_nan.transmittance.len());
     assert!(with_nan.color_depth.iter().flatten().all(|v| v.is_finite()));
+}
+
+/// The step learns from the Gaussians that are left, with larger opacities, and moves no other.
+#[test]
+fn dropped_gaussians_take_no_part() {
+    let Some(gpu) = adapter() else { return };
+    let mut rng = Rng::with_seed(12);
+    let camera = crate::common::camera(&mut rng, 64, 48);
+    let mut cloud = crate::common::scene(&mut rng, 400, ShDegree::default());
+    cloud.raw_opacities.iter_mut().for_each(|raw| *raw = raw.min(0.0) - 0.5);
+    let (image, wide) = target(&mut rng, camera.pinhole);
+    let image = upload_target(&gpu, &image, &wide);
+    let dropout = Dropout { share: 0.3, seed: 77 };
+    let is_dropped = |i: u32| {
+        let state = (i + dropout.seed).wrapping_mul(747_796_405).wrapping_add(2_891_336_453);
+        let word = ((state >> ((state >> 28) + 4)) ^ state).wrapping_mul(277_803_737);
+        f64::from((word >> 22) ^ word) < 0.3 * f64::from(u32::MAX)
+    };
+    let mut rest = cloud.emptied();
+    for i in (0..cloud.len()).filter(|i| !is_dropped(*i as u32)) {
+        let mut gaussian = cloud.get(i);
+        gaussian.raw_opacity = raw_opacity_from_opacity(opacity_from_raw(gaussian.raw_opacity) / 0.7);
+        rest.push(gaussian);
+    }
+    let share = 1.0 - rest.len() as f64 / cloud.len() as f64;
+    assert!((share - 0.3).abs() < 0.07, "{share}");
+    let loss = LossConfig::default();
+    for mut trainer in both_forms(&gpu) {
+        let mut learn = |cloud: &GaussianCloud, dropout: Dropout| {
+            let on_gpu = upload(&gpu, cloud);
+            let views = [TrainingView { dropout, ..TrainingView::new(camera, &image) }];
+            let reports = trainer.steps(&on_gpu, &views, &loss, &AdamConfig::default()).unwrap();
+            (reports[0].loss.total(&loss), reports[0].counts.visible, on_gpu.download(&gpu).unwrap())
+        };
+        let (dropped, visible, moved) = learn(&cloud, dropout);
+        let (expected, visible_then, _) = learn(&rest, Dropout::default());
+        assert!((dropped - expected).abs() < 1e-4 * expected && visible == visible_then, "{dropped} is not {expected}");
+        let whole = learn(&cloud, Dropout::default()).0;
+        assert!((dropped - whole).abs() > 1e-3 * whole, "the dropout does nothing here: {dropped}, {whole}");
+        let has_moved = |i: usize| moved.get(i) != cloud.get(i);
+        assert!((0..cloud.len()).all(|i| !(is_dropped(i as u32) && has_moved(i))));
+        assert!((0..cloud.len()).filter(|i| has_moved(*i)).count() > 100);
+    }
 }
 
 #[test]

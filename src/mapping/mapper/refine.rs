@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::mapping::{DensityConfig, MappingError, RefineConfig};
 use crate::optimise::AdamConfig;
+use crate::splat::model::Dropout;
 
 use super::{BATCH, Interlude, Mapper, Step, Taken};
 
@@ -124,6 +125,13 @@ impl Mapper {
         (0..count).filter_map(|_| next()).map(|keyframe| Step { coarse, ..Step::new(keyframe) }).collect()
     }
 
+    /// Lets each step leave out a share of the Gaussians, others each time.
+    fn drop_out(&mut self, steps: &mut [Step], share: f32) {
+        if share > 0.0 {
+            steps.iter_mut().for_each(|step| step.dropout = Dropout { share, seed: self.rng.u32(..) });
+        }
+    }
+
     /// All keyframes, ascending.
     fn views(&self) -> Vec<usize> {
         (0..self.keyframes.len()).collect()
@@ -167,7 +175,8 @@ impl Mapper {
         let end = refinement.done + density_every.min(left);
         while refinement.done < end && !refinement.is_done() && refinement.interlude(self, interlude)?.is_continue() {
             let coarse = refinement.progress() < half_size_share;
-            let batch = self.draw(BATCH.min(end - refinement.done), coarse);
+            let mut batch = self.draw(BATCH.min(end - refinement.done), coarse);
+            self.drop_out(&mut batch, refinement.config.dropout * refinement.progress());
             adam = refinement.rates();
             taken += self.steps(&batch, &adam, None)?.0;
             refinement.done += batch.len();

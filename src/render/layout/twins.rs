@@ -56,8 +56,12 @@ host_twins! {
         intersection_capacity: u32,
         /// 1 where the map is antialiased, else 0.
         antialiased: f32,
-        /// Unused.
-        pad: [u32; 3],
+        /// Gaussians whose hash is below this are left out.
+        dropped_below: u32,
+        /// Added to their places before these are hashed.
+        dropout_seed: u32,
+        /// Factor of the opacities.
+        opacity_gain: f32,
     }
     /// Counts made on the GPU, and the indirect dispatches that follow from them (`shaders/shared/counters.wgsl`).
     #[derive(Default)]
