@@ -12,8 +12,9 @@ struct Projection {
     // Rows of the Jacobian of the pinhole projection at the (clamped) mean, pixels per metre.
     jacobian_x: vec3<f32>,
     jacobian_y: vec3<f32>,
-    // Image covariance xx, xy, yy in pixels², dilated.
+    // Image covariance xx, xy, yy in pixels², dilated; and by how much.
     covariance: vec3<f32>,
+    dilation: f32,
     determinant: f32,
     // The scaled axes in the image: columns of T, pixels.
     image_axis_0: vec2<f32>,
@@ -68,11 +69,12 @@ fn project_gaussian(view_: View, mean: vec3<f32>, log_scale: vec4<f32>, unit_rot
     out.jacobian_y = vec3(0.0, view_.intrinsics.y * inverse_z, -view_.intrinsics.y * clamped.y * inverse_z);
     let row_x = out.jacobian_x * out.axes_in_camera;
     let row_y = out.jacobian_y * out.axes_in_camera;
-    out.covariance = vec3(dot(row_x, row_x) + DILATION, dot(row_x, row_y), dot(row_y, row_y) + DILATION);
+    out.dilation = mix(DILATION, ANTIALIASED_DILATION, view_.antialiased);
+    out.covariance = vec3(dot(row_x, row_x) + out.dilation, dot(row_x, row_y), dot(row_y, row_y) + out.dilation);
     // |x|²|y|² - (x·y)² = |x×y|²: without this a needle's determinant drowns in rounding.
     let area = cross(row_x, row_y);
     out.sharp_determinant = dot(area, area);
-    out.determinant = out.sharp_determinant + DILATION * (out.covariance.x + out.covariance.z - DILATION);
+    out.determinant = out.sharp_determinant + out.dilation * (out.covariance.x + out.covariance.z - out.dilation);
     let undiluted = sqrt(max(out.sharp_determinant / out.determinant, LEAST_UNDILUTED));
     out.compensation = sqrt(out.kept.x * out.kept.y * out.kept.z) * mix(1.0, undiluted, view_.antialiased);
     out.image_axis_0 = vec2(row_x.x, row_y.x);
@@ -92,13 +94,13 @@ fn conic_factor(p: Projection) -> vec3<f32> {
 // Σ⁻¹v of the image covariance: the adjugate of a sum of outer products t·tᵀ is the sum of those of the perpendiculars.
 fn inverse_covariance(p: Projection, v: vec2<f32>) -> vec2<f32> {
     let sum = across(p.image_axis_0, v) + across(p.image_axis_1, v) + across(p.image_axis_2, v);
-    return (DILATION * v + sum) / p.determinant;
+    return (p.dilation * v + sum) / p.determinant;
 }
 
 // The same without the dilation, where that leaves more than the least opacity.
 fn inverse_sharp_covariance(p: Projection, v: vec2<f32>) -> vec2<f32> {
     let sum = across(p.image_axis_0, v) + across(p.image_axis_1, v) + across(p.image_axis_2, v);
-    return sum / max(p.sharp_determinant, LEAST_UNDILUTED * DILATION * DILATION);
+    return sum / max(p.sharp_determinant, LEAST_UNDILUTED * p.dilation * p.dilation);
 }
 
 // The part of v across the axis t, times |t|².

@@ -149,6 +149,7 @@ pub fn wgsl_constants(form: BlendForm) -> String {
         ("NEAR_METRES", NEAR_METRES),
         ("FAR_METRES", FAR_METRES),
         ("DILATION", DILATION),
+        ("ANTIALIASED_DILATION", ANTIALIASED_DILATION),
         ("SMOOTHING", SMOOTHING),
         ("LEAST_UNDILUTED", LEAST_UNDILUTED),
         ("MIN_DETERMINANT", MIN_DETERMINANT),

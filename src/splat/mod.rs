@@ -19,7 +19,7 @@ pub struct GaussianCloud {
     /// Degree of the spherical harmonics.
     pub sh_degree: ShDegree,
     /// Whether opacities are those of Gaussians without the pixel's dilation and shrink with it: the 2D filter of Mip-Splatting (Yu et al.
-    /// 2024), with 3DGS' width.
+    /// 2024).
     pub antialiased: bool,
     /// `[N, 3]` world, metres.
     pub means: Vec<Vec3>,

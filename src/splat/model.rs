@@ -17,6 +17,8 @@ pub const NEAR_METRES: f64 = 0.05;
 pub const FAR_METRES: f64 = 1e5;
 /// Added to the image covariance's diagonal, pixels²: the footprint of a pixel (3DGS).
 pub const DILATION: f64 = 0.3;
+/// The same of an antialiased map: its smoothing takes the place of the rest (Mip-Splatting).
+pub const ANTIALIASED_DILATION: f64 = 0.1;
 /// Standard deviation of the smoothing of an antialiased map in sampling intervals: √0.2 (Mip-Splatting, Yu et al. 2024).
 pub const SMOOTHING: f64 = 0.447_213_595_499_957_94;
 /// Least square of the factor by which an antialiased map's opacities shrink in the image.

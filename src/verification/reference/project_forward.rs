@@ -74,7 +74,7 @@ pub fn project(view: &View64, g: &Gaussian64) -> Option<Projected64> {
     let jacobian = Matrix2x3::new(p.fx / z, 0.0, -p.fx * clamped.x / z, 0.0, p.fy / z, -p.fy * clamped.y / z);
     let t = jacobian * axes;
     let sharp = t * t.transpose();
-    let covariance = sharp + Matrix2::identity() * model::DILATION;
+    let covariance = sharp + Matrix2::identity() * if view.antialiased { model::ANTIALIASED_DILATION } else { model::DILATION };
     if !(covariance.determinant() >= model::MIN_DETERMINANT && covariance.determinant() < 1e30) {
         return None;
     }

@@ -29,7 +29,6 @@ uniform vec2 range;
 layout(location = 0) out uvec4 shape;
 layout(location = 1) out uvec4 paint;
 
-const float DILATION = 0.3;
 const float ALPHA_MIN = 1.0 / 255.0;
 const float SQRT_HALF = 0.70710678;
 
@@ -126,9 +125,10 @@ void main() {
   vec2 tangent = clamp(p.xy / p.z, bounds.xz, bounds.yw);
   vec3 row_x = vec3(intrinsics.x / p.z, 0.0, -intrinsics.x * tangent.x / p.z) * axes;
   vec3 row_y = vec3(0.0, intrinsics.y / p.z, -intrinsics.y * tangent.y / p.z) * axes;
-  vec3 covariance = vec3(dot(row_x, row_x) + DILATION, dot(row_x, row_y), dot(row_y, row_y) + DILATION);
+  float dilation = mix(0.3, 0.1, antialiased);
+  vec3 covariance = vec3(dot(row_x, row_x) + dilation, dot(row_x, row_y), dot(row_y, row_y) + dilation);
   vec3 area = cross(row_x, row_y);
-  float determinant = dot(area, area) + DILATION * (covariance.x + covariance.z - DILATION);
+  float determinant = dot(area, area) + dilation * (covariance.x + covariance.z - dilation);
   if (!(determinant >= 1e-6 && determinant < 1e30)) {
     return;
   }
