@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use glam::Vec3;
-use keysplat::export::{ExportFilter, MapFormat, fit_harmonics};
+use keysplat::export::{ExportFilter, MapFormat};
 use keysplat::geometry::{Se3, Trajectory};
 use keysplat::run_folder::outputs;
 use keysplat::splat::ShDegree;
@@ -16,7 +16,7 @@ use super::{Verbosity, print};
 pub struct ExportArgs {
     /// Folder of a run, or a map.
     map: PathBuf,
-    /// File to write; its ending is the format: .ply, .spz or .glb.
+    /// File to write; its ending is the format: .ply, .spz, .sog or .glb.
     out: PathBuf,
     /// Format, where the ending does not say it.
     #[arg(long, value_enum)]
@@ -73,7 +73,7 @@ fn cameras(path: &Path) -> Vec<Se3> {
 pub fn export(args: &ExportArgs, verbosity: Verbosity) -> miette::Result<()> {
     let (path, from) = find(&args.map)?;
     let to = args.format.or_else(|| MapFormat::of_path(&args.out));
-    let to = to.ok_or_else(|| miette!("{} does not say its format; end it in .ply, .spz or .glb", args.out.display()))?;
+    let to = to.ok_or_else(|| miette!("{} does not say its format; end it in .ply, .spz, .sog or .glb", args.out.display()))?;
     let same = |path: &Path| std::fs::canonicalize(path).ok();
     if same(&args.out).is_some_and(|out| Some(out) == same(&path)) {
         return Err(miette!("{} is the map that is exported; choose another file", path.display()));
@@ -84,11 +84,7 @@ pub fn export(args: &ExportArgs, verbosity: Verbosity) -> miette::Result<()> {
     if part.is_empty() {
         return Err(miette!("of {} Gaussians, none passes; widen --crop or lower --min-opacity", cloud.len()));
     }
-    let part = match to.most_harmonic() {
-        Some(most) => fit_harmonics(&part, &cameras(&args.map), most),
-        None => part,
-    };
-    let bytes = to.write(&part, &args.out).into_diagnostic()?.len();
+    let bytes = to.write_for(&part, &cameras(&args.map), &args.out).into_diagnostic()?.len();
     if verbosity.quiet {
         return Ok(());
     }

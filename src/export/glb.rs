@@ -22,8 +22,7 @@ pub(super) const FORMAT: FormatRow = FormatRow {
     help: "glTF binary with KHR_gaussian_splatting, float; engines and three.js read it.",
     is_lossless: false,
     tolerance: 5e-5,
-    most_harmonic: None,
-    encode,
+    encode: Some(|cloud, _| encode(cloud)),
     decode,
 };
 

@@ -19,8 +19,7 @@ pub(super) const FORMAT: FormatRow = FormatRow {
     help: "PLY of the 3D Gaussian Splatting reference code, binary little endian; every viewer reads it.",
     is_lossless: true,
     tolerance: 1e-6,
-    most_harmonic: None,
-    encode,
+    encode: Some(|cloud, _| encode(cloud)),
     decode,
 };
 

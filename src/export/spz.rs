@@ -11,7 +11,9 @@ use flate2::write::GzEncoder;
 use glam::{Quat, Vec3};
 
 use super::axes::turned;
+use super::harmonics::fit_harmonics;
 use super::{ExportError, FileSize, FormatRow};
+use crate::geometry::Se3;
 use crate::splat::{Gaussian, GaussianCloud, ShDegree, opacity_from_raw, raw_opacity_from_opacity, unit_rotation};
 
 /// The format's row in the table of formats.
@@ -21,8 +23,7 @@ pub(super) const FORMAT: FormatRow = FormatRow {
     help: "SPZ version 3: about a fifth of the PLY's size, quantised; most web viewers read it.",
     is_lossless: false,
     tolerance: 0.06,
-    most_harmonic: Some(127.0 / 128.0),
-    encode,
+    encode: Some(encode),
     decode,
 };
 
@@ -36,6 +37,8 @@ const STEP: f32 = 1.0 / 8.0;
 const POSITION_BITS: i32 = 24;
 /// A colour's byte per unit of the constant harmonic.
 const COLOR_SCALE: f32 = 0.15;
+/// Harmonics beyond the constant one are signed bytes, in steps of 1/128.
+const MOST_HARMONIC: f32 = 127.0 / 128.0;
 /// Bytes are `(log scale + 10) · 16`.
 const LOG_SCALE: (f32, f32) = (10.0, 16.0);
 /// Readers refuse more.
@@ -51,14 +54,15 @@ fn stride(version: u32, degree: ShDegree) -> usize {
     9 + 1 + 3 + 3 + rotation + 3 * (degree.coefficients() - 1)
 }
 
-fn encode(cloud: &GaussianCloud) -> Result<Vec<u8>, ExportError> {
+/// Larger harmonics are fitted to the colours that the cameras see.
+fn encode(cloud: &GaussianCloud, cameras: &[Se3]) -> Result<Vec<u8>, ExportError> {
     if let Some(index) = cloud.first_non_finite() {
         return Err(ExportError::NonFinite { index });
     }
     if cloud.len() as u64 > MOST_GAUSSIANS {
         return Err(ExportError::Encode { reason: format!("SPZ holds {MOST_GAUSSIANS} Gaussians at most") });
     }
-    let cloud = turned(cloud);
+    let cloud = turned(&fit_harmonics(cloud, cameras, MOST_HARMONIC));
     let bits = fractional_bits(&cloud);
     let coefficients = cloud.sh_degree.coefficients();
     let mut bytes = Vec::with_capacity(HEADER + cloud.len() * stride(VERSION, cloud.sh_degree));
