@@ -27,25 +27,38 @@ const MOST_CAMERAS: usize = 200;
 /// Harmonics give a colour less this.
 const GREY: f64 = 0.5;
 
-/// The basis functions in the directions of the cameras that see a point.
-pub(super) struct Seen(Vec<Coefficients>);
+/// Share of an image that a Gaussian without cameras counts as, per square metre.
+const UNSEEN: f64 = 1e-3;
+
+/// The basis functions in the directions of the cameras that see a point, and how near these are.
+pub(super) struct Seen {
+    bases: Vec<Coefficients>,
+    squared_distances: Vec<f64>,
+}
 
 impl Seen {
     /// From the point and the cameras' poses, world from camera.
     pub fn new(mean: glam::Vec3, cameras: &[Se3]) -> Self {
         let point = Vector3::from(mean.to_array().map(f64::from));
-        let basis = |camera: &Se3| {
-            let direction = (point - camera.translation.vector).try_normalize(1e-9)?;
+        let seen = |camera: &Se3| {
+            let away = point - camera.translation.vector;
+            let direction = away.try_normalize(1e-9)?;
             let is_seen = direction.dot(&(camera.rotation * Vector3::z())) > CONE;
-            is_seen.then(|| Coefficients::from(sh::basis(&direction)))
+            is_seen.then(|| (Coefficients::from(sh::basis(&direction)), away.norm_squared()))
         };
         let step = cameras.len().div_ceil(MOST_CAMERAS).max(1);
-        Self(cameras.iter().step_by(step).filter_map(basis).collect())
+        let (bases, squared_distances) = cameras.iter().step_by(step).filter_map(seen).unzip();
+        Self { bases, squared_distances }
+    }
+
+    /// How much of the cameras' images an area there fills, square metres, up to a constant.
+    pub fn share(&self, area: f64) -> f64 {
+        if self.is_empty() { area * UNSEEN } else { self.squared_distances.iter().map(|squared| area / (squared + area)).sum() }
     }
 
     /// Whether no camera sees it.
     pub fn is_empty(&self) -> bool {
-        self.0.is_empty()
+        self.bases.is_empty()
     }
 
     /// Mean of the products of the basis functions; that over all directions where no camera sees it.
@@ -53,12 +66,12 @@ impl Seen {
         if self.is_empty() {
             return Normal::identity() / (4.0 * std::f64::consts::PI);
         }
-        self.0.iter().fold(Normal::zeros(), |sum, basis| sum + basis * basis.transpose()) / self.0.len() as f64
+        self.bases.iter().fold(Normal::zeros(), |sum, basis| sum + basis * basis.transpose()) / self.bases.len() as f64
     }
 
     /// Colours of coefficients, from each camera; below 0 they are drawn as 0.
     fn colors<'a>(&'a self, coefficients: &'a Coefficients) -> impl Iterator<Item = f64> + 'a {
-        self.0.iter().map(|basis| basis.dot(coefficients) + GREY)
+        self.bases.iter().map(|basis| basis.dot(coefficients) + GREY)
     }
 
     /// What `found` should show to be drawn as `wanted` is: where that is black, anything black.
@@ -71,9 +84,15 @@ impl Seen {
     pub fn constant(&self, wanted: &Coefficients, found: &Coefficients) -> f64 {
         let mut found = *found;
         found[0] = wanted[0];
-        for _ in 0..if self.is_empty() { 0 } else { ROUNDS } {
-            let missing: f64 = self.targets(wanted, &found).into_iter().zip(self.colors(&found)).map(|(a, b)| a - b).sum();
-            found[0] += missing / (self.0.len() as f64 * f64::from(sh::SH_C0));
+        for _ in 0..ROUNDS {
+            let targets = self.targets(wanted, &found);
+            // Views that stay black have no say.
+            let (mut missing, mut views) = (0.0, 0u32);
+            for (target, color) in targets.into_iter().zip(self.colors(&found)).filter(|(target, color)| target != color) {
+                missing += target - color;
+                views += 1;
+            }
+            found[0] += missing / (f64::from(views.max(1)) * f64::from(sh::SH_C0));
         }
         found[0]
     }
@@ -85,8 +104,8 @@ impl Seen {
         let mut found = bounded(&normal, &(normal * wanted), &wanted.map(|_| 0.0), Bounds { wanted, most, count });
         for _ in 0..ROUNDS {
             let targets = self.targets(wanted, &found);
-            let seen = self.0.iter().zip(targets).fold(Coefficients::zeros(), |sum, (basis, t)| sum + basis * (t - GREY));
-            let right = seen / self.0.len().max(1) as f64 + ridge * wanted;
+            let seen = self.bases.iter().zip(targets).fold(Coefficients::zeros(), |sum, (basis, t)| sum + basis * (t - GREY));
+            let right = seen / self.bases.len().max(1) as f64 + ridge * wanted;
             let before = found;
             found = bounded(&normal, &right, &found, Bounds { wanted, most, count });
             if (found - before).amax() < SETTLED {

@@ -22,9 +22,14 @@ pub(super) struct Plane {
 }
 
 impl Plane {
+    /// Pixels side by side in the image of so many.
+    pub fn width(count: usize) -> usize {
+        count.isqrt().max(1).next_multiple_of(4)
+    }
+
     /// As nearly square as fits `count` pixels, in multiples of four; those beyond are empty.
     pub fn of(count: usize, pixel: impl Fn(usize) -> [u8; 4]) -> Self {
-        let width = count.isqrt().max(1).next_multiple_of(4);
+        let width = Self::width(count);
         let height = count.div_ceil(width).max(1).next_multiple_of(4);
         // The last pixel again: a run costs nothing.
         let pixels = (0..width * height).map(|i| if count == 0 { [0, 0, 0, 255] } else { pixel(i.min(count - 1)) });
@@ -59,10 +64,19 @@ impl Writer {
         Self(ZipWriter::new(Cursor::default()))
     }
 
-    /// Stored as it is, and without a date, so that the same map gives the same bytes.
+    /// Stored as it is.
     pub fn add(&mut self, name: &str, bytes: &[u8]) -> Result<(), String> {
-        let options =
-            SimpleFileOptions::default().compression_method(CompressionMethod::Stored).last_modified_time(DateTime::DEFAULT);
+        self.add_by(CompressionMethod::Stored, name, bytes)
+    }
+
+    /// Compressed.
+    pub fn add_deflated(&mut self, name: &str, bytes: &[u8]) -> Result<(), String> {
+        self.add_by(CompressionMethod::Deflated, name, bytes)
+    }
+
+    /// Without a date, so that the same map gives the same bytes.
+    fn add_by(&mut self, method: CompressionMethod, name: &str, bytes: &[u8]) -> Result<(), String> {
+        let options = SimpleFileOptions::default().compression_method(method).last_modified_time(DateTime::DEFAULT);
         self.0.start_file(name, options).map_err(|error| error.to_string())?;
         self.0.write_all(bytes).map_err(|error| error.to_string())
     }

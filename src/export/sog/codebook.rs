@@ -18,8 +18,9 @@ impl Codebook {
         sorted.sort_unstable_by(f32::total_cmp);
         let (least, most) = sorted.first().zip(sorted.last()).map_or((0.0, 0.0), |(a, b)| (*a, *b));
         let mut values = if f64::from(most) - f64::from(least) <= f64::from(step) * (ENTRIES - 1) as f64 {
-            let last = ((most - least) / step).round() as usize;
-            (0..=last).map(|k| least + step * k as f32).collect()
+            // Multiples of the step: short in the file.
+            let place = |number: f32| (f64::from(number) / f64::from(step)).round() as i64;
+            (place(least)..=place(most)).take(ENTRIES).map(|k| (k as f64 * f64::from(step)) as f32).collect()
         } else {
             lloyd(&sorted)
         };

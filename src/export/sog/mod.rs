@@ -22,7 +22,7 @@ pub(super) const FORMAT: FormatRow = FormatRow {
     extension: "sog",
     help: "SOG version 2: less than a tenth of the PLY's size, with a palette of harmonics; PlayCanvas and most web viewers read it.",
     is_lossless: false,
-    tolerance: 0.06,
+    tolerance: 0.12,
     encode: Some(write::encode),
     decode: read::decode,
 };

@@ -1,4 +1,4 @@
-//! An order of points in which neighbours in space are mostly neighbours (Morton 1966).
+//! An order of points in which neighbours in space are mostly neighbours in an image, beside or above each other (Morton 1966).
 
 use glam::{DVec3, Vec3};
 
@@ -19,6 +19,19 @@ pub(super) fn order(points: &[Vec3]) -> Vec<usize> {
     let mut order: Vec<usize> = (0..points.len()).collect();
     order.sort_by_key(|i| keys[*i]);
     order
+}
+
+/// Indices of the points, row by row of an image of that width: those in the order of space fill it along the curve of the plane.
+pub(super) fn image_order(points: &[Vec3], width: usize) -> Vec<usize> {
+    let key = |pixel: &usize| {
+        let [x, y] = [pixel % width, pixel / width].map(|v| spread(v as u64));
+        x | y << 1
+    };
+    let mut pixels: Vec<usize> = (0..points.len()).collect();
+    pixels.sort_by_key(key);
+    let mut image = vec![0; points.len()];
+    order(points).into_iter().zip(pixels).for_each(|(i, pixel)| image[pixel] = i);
+    image
 }
 
 /// Two zeros after each bit.
@@ -48,6 +61,13 @@ mod tests {
         assert_eq!(sorted, (0..points.len()).collect::<Vec<_>>());
         let path = |order: &[usize]| order.windows(2).map(|pair| points[pair[0]].distance(points[pair[1]])).sum::<f32>();
         assert!(path(&order) < 0.25 * path(&sorted));
+        let image = image_order(&points, 64);
+        let above = (64..points.len()).map(|pixel| points[image[pixel]].distance(points[image[pixel - 64]])).sum::<f32>();
+        let by_rows = (64..points.len()).map(|pixel| points[order[pixel]].distance(points[order[pixel - 64]])).sum::<f32>();
+        assert!(above < 0.7 * by_rows, "{above} against {by_rows}");
+        sorted = image;
+        sorted.sort_unstable();
+        assert_eq!(sorted, (0..points.len()).collect::<Vec<_>>());
         assert_eq!(spread(0b101), 0b1_000_001);
         assert_eq!(spread(u64::MAX), 0x1249_2492_4924_9249);
     }

@@ -13,14 +13,15 @@ use crate::geometry::Se3;
 use crate::splat::{GaussianCloud, opacity_from_raw};
 
 /// Gaussians that share an entry, on average: an entry costs about as many bytes as so many labels.
-const GAUSSIANS_PER_ENTRY: usize = 8;
+const GAUSSIANS_PER_ENTRY: usize = 6;
 /// Labels have 16 bits.
 pub(super) const MOST_ENTRIES: usize = 1 << 16;
-/// Weight of harmonics themselves beside the colours in a view: they are smaller then where nobody looks.
-const RIDGE: f64 = 1e-3;
+/// Weight of harmonics themselves beside the colours in a view: they are smaller then where nobody looks. Much to find like ones, and
+/// little once entries are chosen.
+const RIDGES: (f64, f64) = (1e-3, 1e-4);
 /// Entries among which the one of the least change is chosen.
-const CANDIDATES: usize = 16;
-const ROUNDS: usize = 2;
+const CANDIDATES: usize = 48;
+const ROUNDS: usize = 4;
 
 /// Entries, and which of them stands for each Gaussian.
 pub(super) struct Palette {
@@ -35,11 +36,11 @@ impl Palette {
     pub fn new(cloud: &GaussianCloud, cameras: &[Se3]) -> Self {
         let dimensions = 3 * (cloud.sh_degree.coefficients() - 1);
         let wanted = (cloud.len() / GAUSSIANS_PER_ENTRY).next_multiple_of(64).min(MOST_ENTRIES);
-        let values = quiet(cloud, cameras);
+        let values = quiet(cloud, cameras, RIDGES.0);
         if cloud.len() <= wanted {
             return Self { entries: values, labels: (0..cloud.len()).map(|i| i as u16).collect() };
         }
-        let weights: Vec<f32> = (0..cloud.len()).map(|i| weight(cloud, i)).collect();
+        let weights: Vec<f32> = (0..cloud.len()).into_par_iter().map(|i| weight(cloud, i, cameras)).collect();
         let points = Points { values: &values, weights: &weights, dimensions };
         let everyone: Vec<usize> = (0..cloud.len()).collect();
         let groups = kmeans(&points, &everyone, wanted.isqrt());
@@ -47,9 +48,11 @@ impl Palette {
         groups.labels.iter().enumerate().for_each(|(i, group)| members[*group].push(i));
         let errors: Vec<f64> = members.iter().map(|group| group.iter().map(|i| f64::from(groups.errors[*i])).sum()).collect();
         let all = errors.iter().sum::<f64>().max(f64::MIN_POSITIVE);
+        let exact = quiet(cloud, cameras, RIDGES.1);
+        let shown = Shown { cloud, cameras, values: &exact };
         let share = |(group, error): (&Vec<usize>, &f64)| {
             let entries = (error / all * (wanted - wanted.isqrt()) as f64) as usize + 1;
-            refined(&points, (cloud, cameras), group, entries)
+            refined(&points, &shown, group, entries)
         };
         let parts: Vec<(Vec<f32>, Vec<usize>)> = members.par_iter().zip(&errors).map(share).collect();
         let mut palette = Self { entries: Vec::new(), labels: vec![0; cloud.len()] };
@@ -62,16 +65,25 @@ impl Palette {
     }
 }
 
-/// What a Gaussian's error is worth: opacity times the root of its largest cross-section's area.
-fn weight(cloud: &GaussianCloud, i: usize) -> f32 {
+/// What the entries are chosen by.
+struct Shown<'a> {
+    cloud: &'a GaussianCloud,
+    cameras: &'a [Se3],
+    /// `[N, 3 (K − 1)]`, the harmonics that entries stand for.
+    values: &'a [f32],
+}
+
+/// The root of what a Gaussian's squared error is worth: its opacity, and the root of the share of the images that it fills.
+fn weight(cloud: &GaussianCloud, i: usize, cameras: &[Se3]) -> f32 {
     let scale = cloud.log_scales[i];
-    opacity_from_raw(cloud.raw_opacities[i]) * (0.5 * (scale.element_sum() - scale.min_element())).clamp(-40.0, 40.0).exp()
+    let area = f64::from(scale.element_sum() - scale.min_element()).clamp(-60.0, 60.0).exp();
+    opacity_from_raw(cloud.raw_opacities[i]) * Seen::new(cloud.means[i], cameras).share(area).sqrt() as f32
 }
 
 /// The least harmonics that show nearly the same to the cameras, `[N, 3 (K − 1)]`.
-fn quiet(cloud: &GaussianCloud, cameras: &[Se3]) -> Vec<f32> {
+fn quiet(cloud: &GaussianCloud, cameras: &[Se3], ridge: f64) -> Vec<f32> {
     let count = cloud.sh_degree.coefficients();
-    let ridge = Normal::from_diagonal(&Coefficients::from_fn(|k, _| if (1..count).contains(&k) { RIDGE } else { 1e-9 }));
+    let ridge = Normal::from_diagonal(&Coefficients::from_fn(|k, _| if (1..count).contains(&k) { ridge } else { 1e-9 }));
     let rest = |(mean, sh): (&glam::Vec3, &[glam::Vec3])| -> Vec<f32> {
         let seen = Seen::new(*mean, cameras);
         if seen.is_empty() {
@@ -103,21 +115,16 @@ fn visible(seen: &Seen, count: usize) -> Normal {
     let left = normal - first * normal.row(0);
     Normal::from_fn(|i, k| {
         let inside = (1..count).contains(&i) && (1..count).contains(&k);
-        let ridge = f64::from(u8::from(i == k)) * if (1..count).contains(&i) { RIDGE } else { 1.0 };
+        let ridge = f64::from(u8::from(i == k)) * if (1..count).contains(&i) { RIDGES.1 } else { 1.0 };
         if inside { left[(i, k)] + ridge } else { ridge }
     })
 }
 
 /// The entries of a group, and the label of each member among them.
-fn refined(
-    points: &Points<'_>,
-    (cloud, cameras): (&GaussianCloud, &[Se3]),
-    members: &[usize],
-    entries: usize,
-) -> (Vec<f32>, Vec<usize>) {
+fn refined(points: &Points<'_>, shown: &Shown<'_>, members: &[usize], entries: usize) -> (Vec<f32>, Vec<usize>) {
     let found = kmeans(points, members, entries);
     let (mut centroids, mut labels) = (found.centroids, found.labels);
-    let count = cloud.sh_degree.coefficients();
+    let count = shown.cloud.sh_degree.coefficients();
     if members.len() <= entries {
         return (centroids, labels);
     }
@@ -125,23 +132,23 @@ fn refined(
         let index = Centroids::new(&centroids, points.dimensions);
         let mut sums = vec![(Normal::zeros(), [Coefficients::zeros(); 3]); centroids.len() / points.dimensions];
         for (member, label) in members.iter().zip(&mut labels) {
-            let point = points.of(*member);
-            let metric = visible(&Seen::new(cloud.means[*member], cameras), count);
+            let point = &shown.values[member * points.dimensions..(member + 1) * points.dimensions];
+            let metric = visible(&Seen::new(shown.cloud.means[*member], shown.cameras), count);
             let change = |entry: usize| {
                 let at = &centroids[entry * points.dimensions..(entry + 1) * points.dimensions];
                 (0..3).map(|c| quadratic(&metric, &(rest(at, c) - rest(point, c)), count)).sum::<f64>()
             };
-            let mut few = index.nearest_few(point, CANDIDATES);
+            let mut few = index.nearest_few(points.of(*member), CANDIDATES);
             few.push(*label);
             *label =
                 few.into_iter().map(|k| (change(k), k)).min_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1))).expect("some").1;
-            let weight = f64::from(points.weights[*member]);
+            let weight = f64::from(points.weights[*member]).powi(2);
             let (normal, right) = &mut sums[*label];
             *normal += metric * weight;
             (0..3).for_each(|c| right[c] += metric * rest(point, c) * weight);
         }
         for (entry, (normal, right)) in centroids.chunks_mut(points.dimensions).zip(&sums) {
-            let Some(solver) = Cholesky::new(*normal) else { continue };
+            let Some(solver) = Cholesky::new(*normal).filter(|_| normal[(0, 0)] > 0.0) else { continue };
             let solved: [Coefficients; 3] = std::array::from_fn(|c| solver.solve(&right[c]));
             entry.iter_mut().enumerate().for_each(|(at, value)| *value = solved[at % 3][at / 3 + 1] as f32);
         }

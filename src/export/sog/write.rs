@@ -12,10 +12,13 @@ use crate::export::harmonics::{Seen, channel};
 use crate::geometry::Se3;
 use crate::splat::{GaussianCloud, opacity_from_raw, unit_rotation};
 
-/// Steps of the logarithms of sizes, of constant harmonics and of others: those of SPZ, which cost nothing that shows.
-const SCALE_STEP: f32 = 1.0 / 16.0;
-const CONSTANT_STEP: f32 = 1.0 / (0.15 * 255.0);
-const HARMONIC_STEP: f32 = 1.0 / 32.0;
+/// Steps of the logarithms of sizes, of constant harmonics and of others: a twentieth of a size or less, half a percent of white, and less
+/// than a palette changes.
+const SCALE_STEP: f32 = 1.0 / 12.0;
+const CONSTANT_STEP: f32 = 0.025;
+const HARMONIC_STEP: f32 = 1.0 / 20.0;
+/// Positions are rounded to this share of the median of the Gaussians' least extents, or finer.
+const STEP: f64 = 1.0 / 8.0;
 /// Sides of WebP images are at most this.
 const MOST_GAUSSIANS: usize = 16_383 * 16_383;
 
@@ -28,7 +31,7 @@ pub(super) fn encode(cloud: &GaussianCloud, cameras: &[Se3]) -> Result<Vec<u8>, 
         return Err(ExportError::Encode { reason: format!("SOG holds {MOST_GAUSSIANS} Gaussians at most") });
     }
     let mut sorted = GaussianCloud::new(cloud.sh_degree);
-    super::morton::order(&cloud.means).into_iter().for_each(|i| sorted.push(cloud.get(i)));
+    super::morton::image_order(&cloud.means, Plane::width(cloud.len())).into_iter().for_each(|i| sorted.push(cloud.get(i)));
     bundle(sorted, cameras).map_err(|reason| ExportError::Encode { reason })
 }
 
@@ -36,7 +39,7 @@ fn bundle(mut cloud: GaussianCloud, cameras: &[Se3]) -> Result<Vec<u8>, String> 
     let mut zip = Writer::new();
     let harmonics = if cloud.sh_degree.get() > 0 { Some(write_harmonics(&mut zip, &mut cloud, cameras)?) } else { None };
     let count = cloud.len();
-    let means = write_means(&mut zip, &cloud.means)?;
+    let means = write_means(&mut zip, &cloud)?;
     zip.add_plane("quats.webp", &Plane::of(count, |i| smallest_three(cloud.rotations[i])))?;
     let scales = Codebook::new(cloud.log_scales.iter().flat_map(|scale| scale.to_array()), SCALE_STEP);
     let coded = |codebook: &Codebook, values: Vec3, last: u8| {
@@ -58,18 +61,31 @@ fn bundle(mut cloud: GaussianCloud, cameras: &[Se3]) -> Result<Vec<u8>, String> 
         sh0: Coded { codebook: colors.0, files: ["sh0.webp".into()] },
         harmonics,
     };
-    zip.add(META, &serde_json::to_vec(&meta).map_err(|error| error.to_string())?)?;
+    zip.add_deflated(META, &serde_json::to_vec(&meta).map_err(|error| error.to_string())?)?;
     zip.finish()
 }
 
-fn write_means(zip: &mut Writer, means: &[Vec3]) -> Result<Means, String> {
+/// Median of the Gaussians' least extents, metres.
+fn median_extent(cloud: &GaussianCloud) -> f64 {
+    let mut least: Vec<f32> = cloud.log_scales.iter().map(|scale| scale.min_element()).collect();
+    let middle = least.len() / 2;
+    if least.is_empty() { 0.0 } else { f64::from(*least.select_nth_unstable_by(middle, f32::total_cmp).1).exp() }
+}
+
+fn write_means(zip: &mut Writer, cloud: &GaussianCloud) -> Result<Means, String> {
+    let means = &cloud.means;
     let logs: Vec<[f64; 3]> = means.iter().map(|mean| mean.to_array().map(|v| compressed(f64::from(v)))).collect();
     let bound = |k: usize, pick: fn(f64, f64) -> f64| logs.iter().map(|log| log[k]).reduce(pick).unwrap_or(0.0);
     let (mins, maxs) = ([0, 1, 2].map(|k| bound(k, f64::min)), [0, 1, 2].map(|k| bound(k, f64::max)));
+    let extent = median_extent(cloud);
     let code = |i: usize| {
         [0, 1, 2].map(|k| {
             let span = maxs[k] - mins[k];
-            if span > 0.0 { ((logs[i][k] - mins[k]) / span * MOST_CODE).round() as u16 } else { 0 }
+            // Steps grow with the distance from the origin.
+            let step = span / MOST_CODE * (1.0 + f64::from(cloud.means[i][k].abs()));
+            let steps = (STEP * extent / step).clamp(1.0, 256.0).log2().floor().exp2();
+            let code = ((logs[i][k] - mins[k]) / span * MOST_CODE / steps).round() * steps;
+            if span > 0.0 { code.min(MOST_CODE) as u16 } else { 0 }
         })
     };
     let half = |shift: u32| {
@@ -120,7 +136,8 @@ fn write_harmonics(zip: &mut Writer, cloud: &mut GaussianCloud, cameras: &[Se3])
     zip.add_plane("shN_centroids.webp", &Plane { width, height, pixels })?;
     let label = |i: usize| {
         let [low, high] = found.labels[i].to_le_bytes();
-        [low, high, 0, 255]
+        // Blue is not read; equal to green it costs nothing.
+        [low, high, high, 255]
     };
     zip.add_plane("shN_labels.webp", &Plane::of(cloud.len(), label))?;
     let files = ["shN_centroids.webp".into(), "shN_labels.webp".into()];
