@@ -10,6 +10,7 @@ mod ply;
 mod sog;
 mod splat;
 mod spz;
+mod spz4;
 
 pub use filter::ExportFilter;
 
@@ -25,15 +26,16 @@ use crate::geometry::Se3;
 use crate::splat::GaussianCloud;
 
 /// All formats; the first one is the default, and the last ones are only read.
-static FORMATS: [MapFormat; 5] = [
+static FORMATS: [MapFormat; 6] = [
     MapFormat(&ply::FORMAT),
     MapFormat(&spz::FORMAT),
     MapFormat(&sog::FORMAT),
     MapFormat(&glb::FORMAT),
+    MapFormat(&spz4::FORMAT),
     MapFormat(&splat::FORMAT),
 ];
 /// Of [`FORMATS`].
-const WRITTEN: usize = 4;
+const WRITTEN: usize = 5;
 
 /// Encodes a map for cameras at these poses, world from camera, which may be none.
 type Encoder = fn(&GaussianCloud, &[Se3]) -> Result<Vec<u8>, ExportError>;
@@ -75,7 +77,7 @@ impl MapFormat {
         FORMATS.iter().copied().find(|format| format.name() == name)
     }
 
-    /// The format of a file's extension, in any case.
+    /// The format of a file's extension, in any case; of several, the first. All of an extension are read alike.
     pub fn of_path(path: &Path) -> Option<Self> {
         let extension = path.extension()?.to_str()?;
         FORMATS.iter().copied().find(|format| format.extension().eq_ignore_ascii_case(extension))
@@ -120,7 +122,7 @@ impl MapFormat {
     /// If a value of the map is not finite, or the format is only read.
     pub fn encode_for(self, cloud: &GaussianCloud, cameras: &[Se3]) -> Result<Vec<u8>, ExportError> {
         let encode = self.0.encode.ok_or_else(|| {
-            let names: Vec<String> = FORMATS[..WRITTEN].iter().map(|format| format!(".{}", format.extension())).collect();
+            let names: Vec<String> = FORMATS[..WRITTEN].iter().map(|format| format.name().into()).collect();
             ExportError::ReadOnly { format: self.name(), written: names.join(", ") }
         })?;
         encode(cloud, cameras)
@@ -231,11 +233,11 @@ pub enum ExportError {
         index: usize,
     },
     /// The format is only read.
-    #[error("maps are read from .{format} and not written to it; choose one of {written}")]
+    #[error("maps are read from {format} and not written to it; choose one of {written}")]
     ReadOnly {
         /// The format's name.
         format: &'static str,
-        /// Extensions of those that are written.
+        /// Names of those that are written.
         written: String,
     },
     /// The map cannot be encoded.
@@ -339,7 +341,7 @@ mod tests {
         for format in &FORMATS[WRITTEN..] {
             assert!(serde_json::from_str::<MapFormat>(&format!("\"{}\"", format.name())).is_err());
             let refused = format.encode(&cloud(ShDegree::default(), 1)).unwrap_err().to_string();
-            assert!(refused.contains(&format!(".{}", format.name())) && refused.contains(".ply, .spz"), "{refused}");
+            assert!(refused.contains(format.name()) && refused.contains("ply, spz, sog"), "{refused}");
         }
     }
 
@@ -358,7 +360,7 @@ mod tests {
                 let cloud = cloud(sh_degree, 20);
                 let path = folder.path().join("map").with_extension(format.extension());
                 let bytes = format.write(&cloud, &path).unwrap();
-                assert_eq!(MapFormat::of_path(&path), Some(format));
+                assert_eq!(MapFormat::of_path(&path).map(MapFormat::extension), Some(format.extension()));
                 let back = format.read(&path).unwrap();
                 assert_eq!(back.sh_degree, cloud.sh_degree);
                 let (rough, fine) = (format.tolerance(), format.tolerance() / 50.0);
