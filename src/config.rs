@@ -23,6 +23,9 @@ pub struct Config {
     pub map_scale: f64,
     /// File format of the map.
     pub map_format: MapFormat,
+    /// A map, or the folder of a run, that the map begins with; in the world of the known poses.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub initial_map: Option<PathBuf>,
     /// Keyframes mapped, and rounds of the refinement, between two checkpoints; none are kept where absent.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub checkpoint_every: Option<usize>,
@@ -75,6 +78,7 @@ impl Default for Config {
             adapter: None,
             map_scale: 1.0,
             map_format: MapFormat::default(),
+            initial_map: None,
             checkpoint_every: None,
             replay: ReplayConfig::default(),
             tracking: TrackingConfig::default(),
@@ -282,6 +286,9 @@ impl Config {
         }
         if self.replay.every == 0 {
             return value("replay.every must be at least 1".into());
+        }
+        if self.initial_map.is_some() && !self.replay.known_poses {
+            return value("an initial map needs the world of known poses: use --known-poses (replay.known_poses), too".into());
         }
         if self.checkpoint_every == Some(0) {
             return value("checkpoint_every must be at least 1".into());

@@ -33,7 +33,7 @@ enum What {
     /// One training step, on made-up scenes or on the map of a run, stage by stage, beside what the adapter could do at its best.
     Step(StepArgs),
     /// CPU time of the mapping thread for a keyframe by part, and what passes between it and the adapter.
-    Host(host::HostArgs),
+    Host(Box<host::HostArgs>),
     /// Mappers with different settings on the same keyframes of a recording: time, Gaussians, held-out quality.
     Ablation(ablation::AblationArgs),
     /// Whole runs over sequences, numbers of steps and seeds: what time buys, as table and curves.

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use glam::Vec3;
 use keysplat::export::dataset::DatasetFormat;
-use keysplat::export::{ExportFilter, MapFormat, fit_harmonics};
+use keysplat::export::{ExportFilter, MapFormat};
 use keysplat::files::write_atomically;
 use keysplat::geometry::{Se3, Trajectory};
 use keysplat::run_folder::outputs;
@@ -22,7 +22,7 @@ use super::{Verbosity, print, progress};
 pub struct ExportArgs {
     /// Folder of a run, or, for a map in another format, a map.
     map: PathBuf,
-    /// File to write; its ending is the format: .ply, .spz or .glb. For a dataset, a new folder.
+    /// File to write; its ending is the format: .ply, .spz, .sog or .glb. For a dataset, a new folder.
     out: PathBuf,
     /// Format, where the ending does not say it.
     #[arg(long, value_enum)]
@@ -91,8 +91,9 @@ fn cameras(path: &Path) -> Vec<Se3> {
 
 pub fn export(args: &ExportArgs, verbosity: Verbosity) -> miette::Result<()> {
     let to = args.format.or_else(|| Target::of_path(&args.out));
-    let unknown =
-        || miette!("{} does not say its format; end it in .ply, .spz or .glb, or name one with --format", args.out.display());
+    let unknown = || {
+        miette!("{} does not say its format; end it in .ply, .spz, .sog or .glb, or name one with --format", args.out.display())
+    };
     let done = match to.ok_or_else(unknown)? {
         Target::Map(format) => export_map(args, format)?,
         Target::Dataset(format) => export_images(args, format, verbosity)?,
@@ -112,11 +113,13 @@ fn export_map(args: &ExportArgs, to: MapFormat) -> miette::Result<String> {
     if part.is_empty() {
         return Err(miette!("of {} Gaussians, none passes; widen --crop or lower --min-opacity", cloud.len()));
     }
-    let part = match to.most_harmonic() {
-        Some(most) => fit_harmonics(&part, &cameras(&args.map), most),
-        None => part,
-    };
-    let bytes = to.write(&part, &args.out).into_diagnostic()?.len();
+    if part.antialiased && !to.keeps_antialiasing() {
+        tracing::warn!(
+            "{} has no place for antialiasing: viewers will draw small Gaussians too opaque; .ply and .spz keep it",
+            to.name()
+        );
+    }
+    let bytes = to.write_for(&part, &cameras(&args.map), &args.out).into_diagnostic()?.len();
     Ok(format!("{}: {} Gaussians, {:.1} MiB", args.out.display(), part.len(), bytes as f64 / f64::from(1 << 20)))
 }
 

@@ -53,6 +53,10 @@ pub struct RunArgs {
     /// keyframes after the last one.
     #[arg(long)]
     known_poses: bool,
+    /// Begin with this map (.ply, .spz, .sog, .glb, .splat, or the folder of a run) instead of points. It lies in the world of the known
+    /// poses.
+    #[arg(long, value_name = "MAP", requires = "known_poses")]
+    initial_map: Option<PathBuf>,
     /// Part of the name of the adapter to use (see `keysplat adapters`).
     #[arg(long)]
     adapter: Option<String>,
@@ -157,6 +161,9 @@ impl RunArgs {
         }
         config.map_scale = self.map_scale.or(scale).unwrap_or(config.map_scale);
         config.map_format = self.format.unwrap_or(config.map_format);
+        if let Some(path) = &self.initial_map {
+            config.initial_map = Some(std::path::absolute(path).into_diagnostic()?);
+        }
         config.replay.every = self.every.unwrap_or(config.replay.every);
         config.replay.frames = self.frames.or(config.replay.frames);
         config.replay.real_time |= self.real_time;

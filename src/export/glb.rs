@@ -20,10 +20,10 @@ pub(super) const FORMAT: FormatRow = FormatRow {
     name: "glb",
     extension: "glb",
     help: "glTF binary with KHR_gaussian_splatting, float; engines and three.js read it.",
+    keeps_antialiasing: false,
     is_lossless: false,
     tolerance: 5e-5,
-    most_harmonic: None,
-    encode,
+    encode: Some(|cloud, _| encode(cloud)),
     decode,
 };
 

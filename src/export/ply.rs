@@ -1,7 +1,8 @@
 //! The PLY of the 3D Gaussian Splatting reference code (Kerbl et al. 2023): one vertex a Gaussian, raw parameters, f32.
 //!
 //! Writes binary little endian with the properties in the reference code's order. Reads any binary little-endian PLY whose first
-//! element is `vertex` with these properties as floats, in any order and with others between them.
+//! element is `vertex` with these properties as floats or doubles, in any order and with others between them. Of degree 4, which others
+//! write, it keeps the harmonics up to degree 3.
 //! Left out: ASCII and big-endian files, and the compressed variants of some viewers.
 
 use std::io::{BufRead, Read};
@@ -17,10 +18,10 @@ pub(super) const FORMAT: FormatRow = FormatRow {
     name: "ply",
     extension: "ply",
     help: "PLY of the 3D Gaussian Splatting reference code, binary little endian; every viewer reads it.",
+    keeps_antialiasing: true,
     is_lossless: true,
     tolerance: 1e-6,
-    most_harmonic: None,
-    encode,
+    encode: Some(|cloud, _| encode(cloud)),
     decode,
 };
 
@@ -28,6 +29,9 @@ pub(super) const FORMAT: FormatRow = FormatRow {
 const ANTIALIASED: &str = "comment SplatRenderMode: mip";
 /// No honest header is longer; a file that has no line ends must not be read whole in search of one.
 const MAX_HEADER_BYTES: u64 = 1 << 16;
+
+/// Other programs write harmonics up to degree 4, of which those up to degree 3 are kept.
+const REST_OF_DEGREE_4: usize = 3 * 24;
 
 /// The names of the properties, in the order they are written. The file's normals mean nothing and are zero.
 fn property_names(sh_degree: ShDegree) -> Vec<String> {
@@ -81,10 +85,30 @@ struct VertexLayout {
     vertices: u64,
     stride: usize,
     sh_degree: ShDegree,
-    /// Offset of each of [`property_names`] but the normals, under its name.
-    offsets: Vec<(String, usize)>,
+    /// Place of each of [`property_names`] but the normals.
+    places: Vec<Place>,
     /// Other elements follow the vertices, and more bytes with them.
     more_elements: bool,
+}
+
+/// A property of a vertex.
+#[derive(Debug)]
+struct Place {
+    name: String,
+    /// Bytes from the vertex' start.
+    offset: usize,
+    is_double: bool,
+}
+
+impl Place {
+    fn of(&self, vertex: &[u8]) -> f32 {
+        let bytes = &vertex[self.offset..];
+        if self.is_double {
+            f64::from_le_bytes(bytes[..8].try_into().expect("eight bytes")) as f32
+        } else {
+            f32::from_le_bytes(bytes[..4].try_into().expect("four bytes"))
+        }
+    }
 }
 
 /// Reads a map from a reader of `size` bytes; `path` is named in errors.
@@ -102,13 +126,13 @@ fn decode(reader: &mut dyn BufRead, FileSize(file_bytes): FileSize, path: &Path)
     let antialiased = lines.iter().any(|line| line == ANTIALIASED);
     let mut cloud = GaussianCloud { antialiased, ..GaussianCloud::new(layout.sh_degree) };
     let mut vertex = vec![0u8; layout.stride];
-    let mut values = vec![0.0f32; layout.offsets.len()];
+    let mut values = vec![0.0f32; layout.places.len()];
     for index in 0..vertices {
         reader.read_exact(&mut vertex).map_err(read_error)?;
-        for (value, (name, offset)) in values.iter_mut().zip(&layout.offsets) {
-            *value = f32::from_le_bytes(vertex[*offset..offset + 4].try_into().expect("four bytes"));
+        for (value, place) in values.iter_mut().zip(&layout.places) {
+            *value = place.of(&vertex);
             if !value.is_finite() {
-                return Err(ExportError::Value { path: path.into(), index, property: name.clone(), value: *value });
+                return Err(ExportError::Value { path: path.into(), index, property: place.name.clone(), value: *value });
             }
         }
         let gaussian = gaussian_from_values(&values);
@@ -193,22 +217,32 @@ fn parse_header(lines: &[String], path: &Path) -> Result<VertexLayout, ExportErr
         return Err(end_error("no line says the format".into()));
     }
     let vertices = vertices.ok_or_else(|| end_error("there are no vertices".into()))?;
-    let (sh_degree, offsets) = gaussian_offsets(&properties).map_err(end_error)?;
-    Ok(VertexLayout { vertices, stride, sh_degree, offsets, more_elements })
+    let (sh_degree, places) = gaussian_places(&properties).map_err(end_error)?;
+    Ok(VertexLayout { vertices, stride, sh_degree, places, more_elements })
 }
 
 /// Finds a Gaussian's properties among `(name, type, offset)`; the number of `f_rest` properties gives the degree.
-fn gaussian_offsets(properties: &[(String, &str, usize)]) -> Result<(ShDegree, Vec<(String, usize)>), String> {
+fn gaussian_places(properties: &[(String, &str, usize)]) -> Result<(ShDegree, Vec<Place>), String> {
     let rest = properties.iter().filter(|(name, ..)| name.starts_with("f_rest_")).count();
-    let sh_degree = ShDegree::ALL.into_iter().find(|degree| 3 * (degree.coefficients() - 1) == rest);
-    let sh_degree = sh_degree.ok_or_else(|| format!("{rest} properties are called f_rest_*, not 0, 9, 24 or 45"))?;
+    let written = ShDegree::ALL.into_iter().find(|degree| 3 * (degree.coefficients() - 1) == rest);
+    let highest = ShDegree::ALL[ShDegree::ALL.len() - 1];
+    let sh_degree = written.or((rest == REST_OF_DEGREE_4).then_some(highest));
+    let sh_degree = sh_degree.ok_or_else(|| format!("{rest} properties are called f_rest_*, not 0, 9, 24, 45 or 72"))?;
+    let kept = sh_degree.coefficients() - 1;
+    // Channel by channel in the file, of which each may hold more than are kept.
+    let place_in_file = |name: String| match name.strip_prefix("f_rest_").and_then(|number| number.parse::<usize>().ok()) {
+        Some(number) => format!("f_rest_{}", number / kept * (rest / 3) + number % kept),
+        None => name,
+    };
     let wanted = property_names(sh_degree).into_iter().filter(|name| !["nx", "ny", "nz"].contains(&name.as_str()));
-    let offsets = wanted.map(|wanted| match properties.iter().find(|(name, ..)| *name == wanted) {
-        Some((_, "float" | "float32", offset)) => Ok((wanted, *offset)),
-        Some((_, kind, _)) => Err(format!("the property `{wanted}` is a {kind}, not a float")),
+    let places = wanted.map(place_in_file).map(|wanted| match properties.iter().find(|(name, ..)| *name == wanted) {
+        Some((_, kind @ ("float" | "float32" | "double" | "float64"), offset)) => {
+            Ok(Place { name: wanted, offset: *offset, is_double: kind.ends_with('4') || kind.starts_with('d') })
+        }
+        Some((_, kind, _)) => Err(format!("the property `{wanted}` is of type {kind}, not a float")),
         None => Err(format!("the property `{wanted}` is missing")),
     });
-    Ok((sh_degree, offsets.collect::<Result<_, _>>()?))
+    Ok((sh_degree, places.collect::<Result<_, _>>()?))
 }
 
 fn scalar_bytes(kind: &str) -> Option<usize> {

@@ -98,6 +98,36 @@ fn other_orders_other_properties_and_comments_are_read() {
 }
 
 #[test]
+fn doubles_and_harmonics_of_degree_4_are_read() {
+    let map = cloud(ShDegree::new(3).unwrap(), 3);
+    let bytes = encode(&map).unwrap();
+    let (header, body) = split(&bytes);
+    let names: Vec<&str> = header.lines().filter_map(|line| line.strip_prefix("property float ")).collect();
+    // 24 harmonics a channel, of which the last nine are of degree 4; all as doubles.
+    let values = |vertex: &[u8], name: &str| {
+        let at = 4 * names.iter().position(|known| *known == name).unwrap();
+        f64::from(f32::from_le_bytes(vertex[at..at + 4].try_into().unwrap()))
+    };
+    let mut longer: Vec<String> =
+        names.iter().filter(|name| !name.starts_with("f_rest")).map(|name| (*name).to_owned()).collect();
+    longer.extend((0..72).map(|k| format!("f_rest_{k}")));
+    let mut file = String::from("ply\nformat binary_little_endian 1.0\ncomment SplatRenderMode: mip\nelement vertex 3\n");
+    longer.iter().for_each(|name| file += &format!("property double {name}\n"));
+    let mut file = (file + "end_header\n").into_bytes();
+    for vertex in body.chunks(4 * names.len()) {
+        for name in &longer {
+            let value = match name.strip_prefix("f_rest_").map(|number| number.parse::<usize>().unwrap()) {
+                Some(k) if k % 24 >= 15 => 99.0,
+                Some(k) => values(vertex, &format!("f_rest_{}", k / 24 * 15 + k % 24)),
+                None => values(vertex, name),
+            };
+            file.extend(value.to_le_bytes());
+        }
+    }
+    assert_eq!(read_bytes(&file).unwrap(), read_bytes(&bytes).unwrap());
+}
+
+#[test]
 fn cut_off_or_overlong_files_are_refused() {
     let bytes = encode(&cloud(ShDegree::new(3).unwrap(), 3)).unwrap();
     let (header, _) = split(&bytes);
@@ -124,7 +154,7 @@ fn headers_that_are_not_ours_say_what_is_wrong() {
     let bytes = encode(&cloud(ShDegree::default(), 1)).unwrap();
     let message = |from: &str, to: &str| refusal(&with_header(&bytes, |header| header.replace(from, to)));
     assert!(message("binary_little_endian", "ascii").contains("map.ply:2: `format ascii 1.0` is not supported"));
-    assert!(message("float opacity", "double opacity").contains("`opacity` is a double"));
+    assert!(message("float opacity", "int opacity").contains("`opacity` is of type int, not a float"));
     assert!(message("float opacity", "float alpha").contains("`opacity` is missing"));
     assert!(message("float nx", "float f_rest_0").contains("1 properties are called f_rest_*"));
     assert!(message("float nx", "float x").contains("there twice"));

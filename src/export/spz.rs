@@ -1,6 +1,7 @@
-//! SPZ (Niantic, MIT), versions 2 and 3: one gzip stream of a header and the attributes, one after the other, in 8 to 24 bits each.
+//! SPZ (Niantic, MIT), versions 2 and 3: one gzip stream of a header and the attributes, one after the other, in 8 to 24 bits each. Version 4
+//! has the same attributes in a container of its own, see [`spz4`].
 //!
-//! Writes version 3, which most readers know. Left out: version 4 (zstd), and harmonics above degree 3.
+//! Writes version 3, which most readers know. Left out: harmonics above degree 3.
 
 use std::io::{BufRead, Read, Write};
 use std::path::Path;
@@ -11,7 +12,9 @@ use flate2::write::GzEncoder;
 use glam::{Quat, Vec3};
 
 use super::axes::turned;
-use super::{ExportError, FileSize, FormatRow};
+use super::harmonics::fit_harmonics;
+use super::{ExportError, FileSize, FormatRow, spz4};
+use crate::geometry::Se3;
 use crate::splat::{Gaussian, GaussianCloud, ShDegree, opacity_from_raw, raw_opacity_from_opacity, unit_rotation};
 
 /// The format's row in the table of formats.
@@ -19,31 +22,33 @@ pub(super) const FORMAT: FormatRow = FormatRow {
     name: "spz",
     extension: "spz",
     help: "SPZ version 3: about a fifth of the PLY's size, quantised; most web viewers read it.",
+    keeps_antialiasing: true,
     is_lossless: false,
     tolerance: 0.06,
-    most_harmonic: Some(127.0 / 128.0),
-    encode,
+    encode: Some(encode),
     decode,
 };
 
-const MAGIC: u32 = 0x5053_474e;
+pub(super) const MAGIC: u32 = 0x5053_474e;
 const VERSION: u32 = 3;
 /// Flag of maps whose opacities are compensated for the pixel's dilation.
-const ANTIALIASED: u8 = 1;
+pub(super) const ANTIALIASED: u8 = 1;
 const HEADER: usize = 16;
 /// Positions are fixed-point numbers of 24 bits, of which usually so many are behind the point.
 const FRACTIONAL_BITS: i32 = 12;
 /// More where Gaussians are small: a step is at most this share of the median of their least extents.
 const STEP: f32 = 1.0 / 8.0;
-const POSITION_BITS: i32 = 24;
+pub(super) const POSITION_BITS: i32 = 24;
 /// A colour's byte per unit of the constant harmonic.
 const COLOR_SCALE: f32 = 0.15;
+/// Harmonics beyond the constant one are signed bytes, in steps of 1/128.
+const MOST_HARMONIC: f32 = 127.0 / 128.0;
 /// Bytes are `(log scale + 10) · 16`.
 const LOG_SCALE: (f32, f32) = (10.0, 16.0);
 /// Readers refuse more.
-const MOST_GAUSSIANS: u64 = 10_000_000;
+pub(super) const MOST_GAUSSIANS: u64 = 10_000_000;
 /// A compressed byte stands for no more than this.
-const MOST_INFLATION: u64 = 1032;
+pub(super) const MOST_INFLATION: u64 = 1032;
 /// Opacities of the bytes 0 and 255, whose logits would not be finite.
 const OPACITIES: (f32, f32) = (1.0 / 1024.0, 1.0 - 1.0 / 1024.0);
 
@@ -53,35 +58,63 @@ fn stride(version: u32, degree: ShDegree) -> usize {
     9 + 1 + 3 + 3 + rotation + 3 * (degree.coefficients() - 1)
 }
 
-fn encode(cloud: &GaussianCloud) -> Result<Vec<u8>, ExportError> {
-    if let Some(index) = cloud.first_non_finite() {
-        return Err(ExportError::NonFinite { index });
+/// Attributes of Gaussians as the versions from 3 on have them.
+pub(super) struct Packed {
+    pub count: u32,
+    pub degree: ShDegree,
+    /// Of a position's 24, behind the point.
+    pub bits: i32,
+    /// [`ANTIALIASED`] or none.
+    pub flags: u8,
+    /// Positions, opacities, colours, scales, rotations and harmonics.
+    pub attributes: [Vec<u8>; 6],
+}
+
+impl Packed {
+    /// Larger harmonics are fitted to the colours that the cameras see.
+    pub fn new(cloud: &GaussianCloud, cameras: &[Se3]) -> Result<Self, ExportError> {
+        if let Some(index) = cloud.first_non_finite() {
+            return Err(ExportError::NonFinite { index });
+        }
+        if cloud.len() as u64 > MOST_GAUSSIANS {
+            return Err(ExportError::Encode { reason: format!("SPZ holds {MOST_GAUSSIANS} Gaussians at most") });
+        }
+        let cloud = turned(&fit_harmonics(cloud, cameras, MOST_HARMONIC));
+        let bits = fractional_bits(&cloud);
+        let byte = |value: f32| value.round().clamp(0.0, 255.0) as u8;
+        let fixed = |coordinate: f32| {
+            let most = (1 << (POSITION_BITS - 1)) - 1;
+            let fixed = (f64::from(coordinate) * 2f64.powi(bits)).round() as i32;
+            let [a, b, c, _] = fixed.clamp(-most, most).to_le_bytes();
+            [a, b, c]
+        };
+        let harmonics = || cloud.sh.chunks(cloud.sh_degree.coefficients());
+        let constants = harmonics().flat_map(|sh| sh[0].to_array());
+        let rest = harmonics().flat_map(|sh| sh[1..].iter().flat_map(|c| c.to_array()));
+        let scales = cloud.log_scales.iter().flat_map(|scale| scale.to_array());
+        let attributes = [
+            cloud.means.iter().flat_map(|mean| mean.to_array()).flat_map(fixed).collect(),
+            cloud.raw_opacities.iter().map(|raw| byte(opacity_from_raw(*raw) * 255.0)).collect(),
+            constants.map(|value| byte((value * COLOR_SCALE + 0.5) * 255.0)).collect(),
+            scales.map(|scale| byte((scale + LOG_SCALE.0) * LOG_SCALE.1)).collect(),
+            cloud.rotations.iter().flat_map(|rotation| smallest_three(*rotation).to_le_bytes()).collect(),
+            rest.map(|value| byte(value * 128.0 + 128.0)).collect(),
+        ];
+        let flags = if cloud.antialiased { ANTIALIASED } else { 0 };
+        Ok(Self { count: cloud.len() as u32, degree: cloud.sh_degree, bits, flags, attributes })
     }
-    if cloud.len() as u64 > MOST_GAUSSIANS {
-        return Err(ExportError::Encode { reason: format!("SPZ holds {MOST_GAUSSIANS} Gaussians at most") });
+
+    /// Bytes of each attribute of so many Gaussians.
+    pub fn lengths(count: u64, degree: ShDegree) -> [u64; 6] {
+        [9, 1, 3, 3, 4, 3 * (degree.coefficients() as u64 - 1)].map(|bytes| bytes * count)
     }
-    let cloud = turned(cloud);
-    let bits = fractional_bits(&cloud);
-    let coefficients = cloud.sh_degree.coefficients();
-    let mut bytes = Vec::with_capacity(HEADER + cloud.len() * stride(VERSION, cloud.sh_degree));
-    bytes.extend(MAGIC.to_le_bytes());
-    bytes.extend(VERSION.to_le_bytes());
-    bytes.extend((cloud.len() as u32).to_le_bytes());
-    bytes.extend([cloud.sh_degree.get(), bits as u8, if cloud.antialiased { ANTIALIASED } else { 0 }, 0]);
-    let byte = |value: f32| value.round().clamp(0.0, 255.0) as u8;
-    for coordinate in cloud.means.iter().flat_map(|mean| mean.to_array()) {
-        let most = (1 << (POSITION_BITS - 1)) - 1;
-        let fixed = (f64::from(coordinate) * 2f64.powi(bits)).round() as i32;
-        bytes.extend(&fixed.clamp(-most, most).to_le_bytes()[..3]);
-    }
-    bytes.extend(cloud.raw_opacities.iter().map(|raw| byte(opacity_from_raw(*raw) * 255.0)));
-    let constants = cloud.sh.chunks(coefficients).flat_map(|sh| sh[0].to_array());
-    bytes.extend(constants.map(|value| byte((value * COLOR_SCALE + 0.5) * 255.0)));
-    let scales = cloud.log_scales.iter().flat_map(|scale| scale.to_array());
-    bytes.extend(scales.map(|scale| byte((scale + LOG_SCALE.0) * LOG_SCALE.1)));
-    bytes.extend(cloud.rotations.iter().flat_map(|rotation| smallest_three(*rotation).to_le_bytes()));
-    let harmonics = cloud.sh.chunks(coefficients).flat_map(|sh| sh[1..].iter().flat_map(|c| c.to_array()));
-    bytes.extend(harmonics.map(|value| byte(value * 128.0 + 128.0)));
+}
+
+fn encode(cloud: &GaussianCloud, cameras: &[Se3]) -> Result<Vec<u8>, ExportError> {
+    let packed = Packed::new(cloud, cameras)?;
+    let mut bytes = [MAGIC, VERSION, packed.count].map(u32::to_le_bytes).concat();
+    bytes.extend([packed.degree.get(), packed.bits as u8, packed.flags, 0]);
+    packed.attributes.iter().for_each(|attribute| bytes.extend(attribute));
     let mut encoder = GzEncoder::new(Vec::new(), Compression::best());
     encoder.write_all(&bytes).and_then(|()| encoder.finish()).map_err(|error| ExportError::Encode { reason: error.to_string() })
 }
@@ -127,14 +160,16 @@ fn from_first_three(bytes: &[u8]) -> Quat {
     Quat::from_xyzw(v.x, v.y, v.z, w).normalize()
 }
 
-fn decode(reader: &mut dyn BufRead, FileSize(file_bytes): FileSize, path: &Path) -> Result<GaussianCloud, ExportError> {
+/// All versions that are read.
+pub(super) fn decode(reader: &mut dyn BufRead, size: FileSize, path: &Path) -> Result<GaussianCloud, ExportError> {
+    let FileSize(file_bytes) = size;
     let damaged = |what: String| ExportError::Damaged { path: path.into(), what };
     let mut start = [0u8; 4];
     let peeked = reader.fill_buf().map_err(|source| ExportError::Read { path: path.into(), source })?;
     let known = peeked.len().min(4);
     start[..known].copy_from_slice(&peeked[..known]);
     if u32::from_le_bytes(start) == MAGIC {
-        return Err(damaged("SPZ version 4 is not read; write version 3, or a PLY".into()));
+        return spz4::decode(reader, size, path);
     }
     let mut stream = MultiGzDecoder::new(reader);
     let mut header = [0u8; HEADER];
@@ -158,11 +193,11 @@ fn decode(reader: &mut dyn BufRead, FileSize(file_bytes): FileSize, path: &Path)
         return Err(cut());
     }
     let cloud = unpack(&bytes, count as usize, version, degree, bits);
-    Ok(GaussianCloud { antialiased: header[14] & ANTIALIASED != 0, ..turned(&cloud) })
+    Ok(GaussianCloud { antialiased: header[14] & ANTIALIASED != 0, ..cloud })
 }
 
-/// The Gaussians of the attributes, which are as long as they should be.
-fn unpack(bytes: &[u8], count: usize, version: u32, degree: ShDegree, bits: i32) -> GaussianCloud {
+/// The Gaussians of the attributes, which are as long as they should be, in the map's axes.
+pub(super) fn unpack(bytes: &[u8], count: usize, version: u32, degree: ShDegree, bits: i32) -> GaussianCloud {
     let rotation_bytes = if version >= 3 { 4 } else { 3 };
     let harmonics = degree.coefficients() - 1;
     let (positions, rest) = bytes.split_at(9 * count);
@@ -194,7 +229,7 @@ fn unpack(bytes: &[u8], count: usize, version: u32, degree: ShDegree, bits: i32)
             sh: std::iter::once(constant).chain(beyond).collect(),
         });
     }
-    cloud
+    turned(&cloud)
 }
 
 #[cfg(test)]
@@ -231,7 +266,7 @@ mod tests {
             assert_eq!(only.sh[1], -Vec3::new(0.0, 0.5, 127.0 / 128.0));
             assert_eq!(only.sh[2], -Vec3::new(-1.0, -0.5, 0.0));
         }
-        let bytes = file(4, &word);
+        let bytes = file(5, &word);
         assert!(decode(&mut &*bytes, FileSize(bytes.len() as u64), Path::new("x.spz")).is_err());
     }
 }

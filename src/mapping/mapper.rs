@@ -5,6 +5,7 @@ mod corrections;
 mod exposures;
 mod interlude;
 mod refine;
+mod start;
 mod state;
 mod within_limits;
 
@@ -32,7 +33,7 @@ use crate::geometry::Se3;
 use crate::gpu::Gpu;
 use crate::optimise::{AdamConfig, DensityPasses, OverScores, Survey, SurveyRules, Trainer, TrainingView};
 use crate::render::{GpuCloud, Rendered};
-use crate::sequence::{KnownPoint, RectifiedImage};
+use crate::sequence::RectifiedImage;
 use crate::splat::{Exposure, GaussianCloud, ViewCamera};
 
 /// Gaussians that there is room for at first; the map's buffers grow with it.
@@ -148,20 +149,6 @@ impl Mapper {
         }
         let report = self.optimise(iterations, interlude)?;
         Ok(KeyframeReport { id: keyframe.id, inserted, gaussians: self.cloud.len(), exposure, ..report })
-    }
-
-    /// Takes in points of the scene that are known before any keyframe, in the keyframes' world; `anchor` is the first of these.
-    ///
-    /// # Errors
-    /// [`MappingError`] if a buffer does not fit or the device fails.
-    pub fn add_points(&mut self, known: &[KnownPoint], anchor: KeyframeId) -> Result<(), MappingError> {
-        let mut new = initialise_from_points::gaussians(known, &self.config.points, self.config.sh_degree);
-        if self.probe(self.cloud.len() + new.len()) {
-            new = new.thinned(self.cloud.most(&self.gpu) - self.cloud.len());
-        }
-        let left_out = self.cloud.append(&self.gpu, &new)?;
-        self.anchors.append(anchor, new.len() - left_out);
-        Ok(())
     }
 
     /// Downloads the averaged parameters of all Gaussians. Blocks until the GPU is idle.

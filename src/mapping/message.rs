@@ -1,16 +1,21 @@
 //! The tracker's messages to the mapper.
 
+use std::sync::Arc;
+
 use serde::{Deserialize, Serialize};
 
 use super::{Keyframe, KeyframeId};
 use crate::geometry::Se3;
 use crate::sequence::KnownPoint;
+use crate::splat::GaussianCloud;
 
 /// One message from the tracker to the mapper, in the order of sending. The channel's end is the end of the sequence.
 #[derive(Clone, Debug)]
 pub enum MapperMessage {
     /// Scene points of the recording, before the first keyframe.
     Points(Vec<KnownPoint>),
+    /// A map that others made, before the first keyframe.
+    Map(Arc<GaussianCloud>),
     /// A new keyframe with its image.
     Keyframe(Box<Keyframe>),
     /// New poses of earlier keyframes after bundle adjustment or a loop closure.

@@ -221,6 +221,10 @@ impl MapThread<'_> {
                 mapper.add_points(&points, 0)?;
                 (None, true)
             }
+            MapperMessage::Map(map) => {
+                mapper.add_map(&map, 0)?;
+                (None, true)
+            }
             MapperMessage::PoseUpdate(updates) => (None, mapper.update_poses(&updates)? > 0),
             MapperMessage::Remove(keyframes) => (None, mapper.remove_keyframes(&keyframes)? > 0),
             MapperMessage::Keyframe(keyframe) => {

@@ -10,6 +10,7 @@ use image::RgbImage;
 
 use super::control::Control;
 use super::newest::Newest;
+use crate::export::ExportError;
 use crate::geometry::Se3;
 use crate::mapping::{KeyframeId, MappingError};
 use crate::render::Rendered;
@@ -61,6 +62,15 @@ pub enum PipelineError {
         name: String,
         /// Points found.
         points: usize,
+    },
+    /// The map to begin with cannot be read.
+    #[error("the initial map: {0}")]
+    InitialMap(#[from] ExportError),
+    /// There is no map to begin with.
+    #[error("the initial map {path} is no map that is read; give a .ply, .spz, .sog, .glb or .splat, or the folder of a run")]
+    NoInitialMap {
+        /// The file or folder.
+        path: PathBuf,
     },
     /// A resumed run was stopped before it reached its checkpoint.
     #[error("the run ended before it had caught up with {checkpoint}, which is kept; resume it again")]

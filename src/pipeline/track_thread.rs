@@ -53,7 +53,9 @@ impl<'a> KeyframeSender<'a> {
         match message {
             MapperMessage::PoseUpdate(updates) => self.add_poses(updates),
             MapperMessage::Keyframe(keyframe) => self.deferred += usize::from(self.waiting.replace(keyframe).is_some()),
-            waits @ (MapperMessage::Points(_) | MapperMessage::Remove(_)) => return self.sender.send(waits).is_ok(),
+            waits @ (MapperMessage::Points(_) | MapperMessage::Map(_) | MapperMessage::Remove(_)) => {
+                return self.sender.send(waits).is_ok();
+            }
         }
         self.retry()
     }

@@ -23,6 +23,11 @@ impl MessageDigest {
                 digest.update(bytemuck::cast_slice(point.position.as_slice()));
                 digest.update(point.color);
             }),
+            MapperMessage::Map(map) => {
+                [&map.means, &map.log_scales, &map.sh].into_iter().for_each(|values| digest.update(bytemuck::cast_slice(values)));
+                digest.update(bytemuck::cast_slice(&map.rotations));
+                digest.update(bytemuck::cast_slice(&map.raw_opacities));
+            }
             MapperMessage::PoseUpdate(updates) => digest.update(plain(updates)),
             MapperMessage::Remove(keyframes) => digest.update(plain(keyframes)),
             MapperMessage::Keyframe(keyframe) => {

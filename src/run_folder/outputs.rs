@@ -15,7 +15,7 @@ use crate::evaluation::views::{ComparedView, ViewSelection, ViewSource, evaluate
 use crate::evaluation::{
     Alignment, Comparison, Exposures, draw_trajectory, evaluate_trajectory, machine, sha256_hex, write_json,
 };
-use crate::export::{ExportError, MapFormat, fit_harmonics};
+use crate::export::{ExportError, MapFormat};
 use crate::files::{WriteError, remove_partials, write_atomically};
 use crate::geometry::{Se3, Trajectory};
 use crate::gpu::{Gpu, GpuError};
@@ -174,13 +174,9 @@ pub fn write_results(out: &Path, recording: &Recording, result: &RunResult) -> R
         remove_file(&out.join(map_name(*format)))?;
     }
     let format = recording.config().map_format;
-    let poses = || result.keyframes.iter().map(|keyframe| keyframe.world_from_camera).collect::<Vec<_>>();
-    let map = match format.most_harmonic() {
-        Some(most) => Arc::new(fit_harmonics(&result.cloud, &poses(), most)),
-        None => result.cloud.clone(),
-    };
-    let bytes = format.write(&map, &out.join(map_name(format)))?;
-    let cloud = if format.is_lossless() { map } else { Arc::new(format.decode(&bytes)?) };
+    let poses: Vec<Se3> = result.keyframes.iter().map(|keyframe| keyframe.world_from_camera).collect();
+    let bytes = format.write_for(&result.cloud, &poses, &out.join(map_name(format)))?;
+    let cloud = if format.is_lossless() { result.cloud.clone() } else { Arc::new(format.decode(&bytes)?) };
     Ok(WrittenMap { bytes: bytes.len() as u64, hash: sha256_hex(&bytes), cloud })
 }
 

@@ -42,6 +42,7 @@ const ALLOWED: [(&str, &[&str]); 25] = [
             "gpu",
             "render",
             "mapping",
+            "export",
             "evaluation",
             "config",
             "recording",

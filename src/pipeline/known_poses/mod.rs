@@ -2,7 +2,7 @@
 //!
 //! Photos become keyframes all, frames of a moving camera by the tracker's keyframe thresholds; held-out ones never.
 //! Frames without a pose count as lost. Where the recording has no depth, points begin the map: its own, or triangulated ones, which the
-//! plane sweep then uses as landmarks. The world's unit is that of the poses.
+//! plane sweep then uses as landmarks. A map of others begins it where one is given. The world's unit is that of the poses.
 
 mod scene;
 
@@ -88,7 +88,11 @@ pub(super) fn follow(thread: &TrackThread<'_>, scene: &Scene<'_>) -> TrackSummar
     let mut summary = TrackSummary::default();
     let mut sender = KeyframeSender::new(mapper, config.replay.real_time);
     let mut follower = Follower { recording, scene, rectifiers: Rectifiers::new(config.map_scale), keyframes: Vec::new() };
-    if sequence.sensor != Sensor::Rgbd && mapper.send(MapperMessage::Points(scene.thinned_points())).is_err() {
+    let first = match scene.initial_map() {
+        Some(map) => Some(MapperMessage::Map(map)),
+        None => (sequence.sensor != Sensor::Rgbd).then(|| MapperMessage::Points(scene.thinned_points())),
+    };
+    if first.is_some_and(|message| mapper.send(message).is_err()) {
         return summary;
     }
     let mut world_from_camera = None;

@@ -4,16 +4,21 @@
 
 use std::borrow::Cow;
 use std::collections::{BTreeMap, HashSet};
+use std::path::Path;
+use std::sync::Arc;
 
+use glam::Vec3;
 use nalgebra::{Point3, Vector2, Vector3};
 use rayon::prelude::*;
 
+use crate::export::{ExportFilter, MapFormat};
 use crate::geometry::Se3;
 use crate::mapping::MappingConfig;
 use crate::pipeline::{PipelineError, Progress};
 use crate::recording::Recording;
+use crate::run_folder::outputs;
 use crate::sequence::{Frame, FrameEntry, KnownPoint, Sensor, SensorKind, SequenceError};
-use crate::splat::ViewCamera;
+use crate::splat::{GaussianCloud, ViewCamera};
 use crate::tracking::TrackingConfig;
 use crate::tracking::structure::{PosedView, SeenPoint, triangulate_views};
 
@@ -40,19 +45,31 @@ pub(in crate::pipeline) struct Scene<'a> {
     points: Cow<'a, [KnownPoint]>,
     /// By frame; none where the points came with the recording.
     seen: BTreeMap<usize, Vec<SeenPoint>>,
+    /// What the map begins with instead of the points.
+    initial_map: Option<Arc<GaussianCloud>>,
     /// Median depth of the points in the cameras that have them in view, in the world's unit.
     distance: Option<f64>,
 }
 
 impl<'a> Scene<'a> {
-    /// The scene of a recording. Frames are decoded for it only where the recording has neither points nor depth.
+    /// The scene of a recording. Frames are decoded for it only where there are neither points nor depth nor an initial map, whose centres
+    /// are points as good.
     ///
     /// # Errors
-    /// [`PipelineError::NoStructure`] if too few points can be triangulated.
+    /// [`PipelineError::NoStructure`] if too few points can be triangulated; [`PipelineError::InitialMap`] if that cannot be read.
     pub fn new(recording: &'a Recording, progress: &Progress) -> Result<Self, PipelineError> {
         let sequence = recording.sequence();
-        let mut scene = Self { recording, points: Cow::Borrowed(&sequence.points), seen: BTreeMap::new(), distance: None };
-        if sequence.sensor != Sensor::Rgbd && sequence.points.is_empty() {
+        let mut scene = Self {
+            recording,
+            points: Cow::Borrowed(&sequence.points),
+            seen: BTreeMap::new(),
+            initial_map: recording.config().initial_map.as_deref().map(|path| initial_map(path, recording)).transpose()?,
+            distance: None,
+        };
+        if let Some(map) = scene.initial_map.as_ref().filter(|_| sequence.points.is_empty()) {
+            let point = |mean: &Vec3| KnownPoint { position: Vector3::from(mean.to_array().map(f64::from)), color: [0; 3] };
+            scene.points = map.means.iter().map(point).collect();
+        } else if sequence.sensor != Sensor::Rgbd && sequence.points.is_empty() {
             scene.seen = triangulate(recording, progress)?;
             let points = scene.seen.values().flatten();
             scene.points = points.map(|point| KnownPoint { position: point.position.coords, color: point.color }).collect();
@@ -63,6 +80,11 @@ impl<'a> Scene<'a> {
         }
         scene.distance = scene.median_distance();
         Ok(scene)
+    }
+
+    /// What the map begins with instead of points.
+    pub fn initial_map(&self) -> Option<Arc<GaussianCloud>> {
+        self.initial_map.clone()
     }
 
     /// Median depth of what frames see, in the world's unit.
@@ -113,6 +135,18 @@ impl<'a> Scene<'a> {
         let keep: Vec<bool> = cells.into_iter().map(first).collect();
         self.points.iter().zip(keep).filter(|(_, keep)| *keep).map(|(point, _)| *point).collect()
     }
+}
+
+/// The map of a file or of a run's folder: of more Gaussians than the mapper may have, those that cover most.
+fn initial_map(path: &Path, recording: &Recording) -> Result<Arc<GaussianCloud>, PipelineError> {
+    let found =
+        if path.is_dir() { outputs::find_map(path) } else { MapFormat::of_path(path).map(|format| (path.into(), format)) };
+    let (path, format) = found.ok_or_else(|| PipelineError::NoInitialMap { path: path.into() })?;
+    let map = format.read(&path)?;
+    let max_gaussians = recording.config().mapping.limits.max_gaussians;
+    let map = ExportFilter { max_gaussians, ..ExportFilter::default() }.apply(&map);
+    tracing::info!(gaussians = map.len(), "the map begins with that of {}", path.display());
+    Ok(Arc::new(map))
 }
 
 /// The frames with a pose, at full size.

@@ -1,0 +1,96 @@
+//! SOG version 2 (PlayCanvas' open format; read and written by splat-transform 2.7.1, MIT): a zip of lossless WebP images, one pixel a
+//! Gaussian, and `meta.json`.
+//!
+//! Positions have 16 bits after a logarithm, rotations eight a component, sizes and colours the places in a codebook. Harmonics beyond the
+//! constant one have labels into a palette. Left out: version 1, folders instead of zips, and levels of detail.
+
+mod bundle;
+mod codebook;
+mod kmeans;
+mod morton;
+mod palette;
+mod read;
+mod write;
+
+use serde::{Deserialize, Serialize};
+
+use super::FormatRow;
+
+/// The format's row in the table of formats.
+pub(super) const FORMAT: FormatRow = FormatRow {
+    name: "sog",
+    extension: "sog",
+    help: "SOG version 2: less than a tenth of the PLY's size, with a palette of harmonics; PlayCanvas and most web viewers read it.",
+    keeps_antialiasing: false,
+    is_lossless: false,
+    tolerance: 0.12,
+    encode: Some(write::encode),
+    decode: read::decode,
+};
+
+const VERSION: u32 = 2;
+const META: &str = "meta.json";
+/// Entries of the palette side by side in its image.
+const ENTRIES_A_ROW: usize = 64;
+/// The byte of a rotation whose largest component is w; x, y and z follow.
+const LARGEST: u8 = 252;
+/// Opacities of the bytes 0 and 255, whose logits would not be finite.
+const OPACITIES: (f32, f32) = (1.0 / 1024.0, 1.0 - 1.0 / 1024.0);
+/// Of a position's 16 bits.
+const MOST_CODE: f64 = 65535.0;
+
+/// `meta.json`.
+#[derive(Debug, Serialize, Deserialize)]
+struct Meta {
+    version: u32,
+    count: u64,
+    means: Means,
+    scales: Coded,
+    quats: Files,
+    sh0: Coded,
+    #[serde(rename = "shN", default, skip_serializing_if = "Option::is_none")]
+    harmonics: Option<Palette>,
+}
+
+/// The low and the high bytes of positions between bounds, after the logarithm.
+#[derive(Debug, Serialize, Deserialize)]
+struct Means {
+    mins: [f64; 3],
+    maxs: [f64; 3],
+    files: [String; 2],
+}
+
+/// Places in a codebook.
+#[derive(Debug, Serialize, Deserialize)]
+struct Coded {
+    codebook: Vec<f32>,
+    files: [String; 1],
+}
+
+/// An image without a codebook.
+#[derive(Debug, Serialize, Deserialize)]
+struct Files {
+    files: [String; 1],
+}
+
+/// The palette's image and that of the labels.
+#[derive(Debug, Serialize, Deserialize)]
+struct Palette {
+    count: usize,
+    bands: u8,
+    codebook: Vec<f32>,
+    files: [String; 2],
+}
+
+/// The logarithm that positions are coded in.
+fn compressed(value: f64) -> f64 {
+    value.signum() * value.abs().ln_1p()
+}
+
+fn expanded(value: f64) -> f64 {
+    value.signum() * value.abs().exp_m1()
+}
+
+#[cfg(test)]
+#[path = "tests.rs"]
+mod tests;
