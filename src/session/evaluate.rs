@@ -74,7 +74,7 @@ pub fn evaluate_folder(folder: &Path, options: &EvaluateOptions, on_view: &dyn F
     Ok(metrics)
 }
 
-fn resolve(folder: &Path, options: &EvaluateOptions) -> Result<Config, SessionError> {
+pub(super) fn resolve(folder: &Path, options: &EvaluateOptions) -> Result<Config, SessionError> {
     let own = folder.join(outputs::CONFIG);
     let mut config = if own.is_file() { Config::read(&own).map_err(RecordingError::from)? } else { Config::default() };
     if let Some(path) = &options.sequence {
@@ -92,12 +92,12 @@ fn unreadable(path: &Path, reason: impl Into<String>) -> SessionError {
     SessionError::Unreadable { path: path.into(), reason: reason.into() }
 }
 
-fn read_trajectory(path: &Path) -> Result<Trajectory, SessionError> {
+pub(super) fn read_trajectory(path: &Path) -> Result<Trajectory, SessionError> {
     Ok(Trajectory::read_tum(path)?)
 }
 
 /// The frame nearest in time to each pose, and the pose.
-fn nearest_frames(sequence: &Sequence, trajectory: &Trajectory) -> Vec<(usize, Se3)> {
+pub(super) fn nearest_frames(sequence: &Sequence, trajectory: &Trajectory) -> Vec<(usize, Se3)> {
     let entries = &sequence.entries;
     let nearest = |t: f64| {
         let after = entries.partition_point(|e| e.timestamp_s < t);
@@ -121,7 +121,7 @@ fn exposures(folder: &Path) -> Result<Exposures, SessionError> {
     Exposures::parse(&text).ok_or_else(|| unreadable(&path, advice))
 }
 
-fn earlier_metrics(folder: &Path) -> Result<Option<Metrics>, SessionError> {
+pub(super) fn earlier_metrics(folder: &Path) -> Result<Option<Metrics>, SessionError> {
     let path = folder.join(outputs::METRICS);
     if !path.is_file() {
         return Ok(None);
