@@ -75,7 +75,9 @@ pub enum SessionError {
     #[error(transparent)]
     Mesh(#[from] MeshError),
     /// Measured depth was asked for.
-    #[error("the recording of {folder} has no measured depth at its poses; leave --depth out, or name the recording with --sequence")]
+    #[error(
+        "the recording of {folder} has no measured depth at its poses; leave --depth out, or name the recording with --sequence"
+    )]
     NoMeasuredDepth {
         /// The run's folder.
         folder: PathBuf,

@@ -51,11 +51,15 @@ fn text(report: &MeshReport) -> String {
     ];
     for share in &errors.shares {
         let of = format!("(precision {}, recall {})", percent(share.precision), percent(share.recall));
-        let name = ["F1 at 1 cm", "F1 at 2 cm", "F1 at 5 cm"][usize::from(share.within_m > 0.01) + usize::from(share.within_m > 0.02)];
+        let name =
+            ["F1 at 1 cm", "F1 at 2 cm", "F1 at 5 cm"][usize::from(share.within_m > 0.01) + usize::from(share.within_m > 0.02)];
         lines.push((name, format!("{}   {of}", percent(share.f1))));
     }
     if let Some(depth) = &report.depth {
-        lines.push(("depth L1", format!("{}   ({} views, {} seen)", centimetres(depth.depth_l1_m), depth.views, percent(depth.seen_share))));
+        lines.push((
+            "depth L1",
+            format!("{}   ({} views, {} seen)", centimetres(depth.depth_l1_m), depth.views, percent(depth.seen_share)),
+        ));
     }
     if let Some(by) = report.refined_by_m {
         lines.push(("moved by ICP", centimetres(by)));

@@ -94,5 +94,9 @@ pub fn mesh(args: &MeshArgs, verbosity: Verbosity) -> miette::Result<()> {
     }
     let (triangles, area) = (fused.mesh.triangles.len(), fused.mesh.area());
     let views = format!("{} views, {} with measured depth", fused.views, fused.measured);
-    print(&format!("{}: {triangles} triangles, {area:.1} m², {:.1} MiB, of {views}\n", args.out.display(), bytes as f64 / f64::from(1 << 20)))
+    print(&format!(
+        "{}: {triangles} triangles, {area:.1} m², {:.1} MiB, of {views}\n",
+        args.out.display(),
+        bytes as f64 / f64::from(1 << 20)
+    ))
 }

@@ -129,7 +129,8 @@ fn facets(mesh: &Mesh) -> RTree<Facet> {
 
 /// Distance of each point to the nearest of the tree, metres.
 fn to_points(points: &[[f32; 3]], tree: &RTree<[f32; 3]>) -> Vec<f64> {
-    let nearest = |p: &[f32; 3]| tree.nearest_neighbor(p).map_or(f64::INFINITY, |q| f64::from(Vec3::from(*p).distance(Vec3::from(*q))));
+    let nearest =
+        |p: &[f32; 3]| tree.nearest_neighbor(p).map_or(f64::INFINITY, |q| f64::from(Vec3::from(*p).distance(Vec3::from(*q))));
     points.par_iter().map(nearest).collect()
 }
 

@@ -45,7 +45,7 @@ impl Default for MeshConfig {
             truncation_voxels: 4.0,
             tolerance: 0.02,
             neighbours: 8,
-            min_views: 2,
+            min_views: 1,
             min_component_share: 0.001,
             simplify: None,
             max_memory_bytes: 4 << 30,

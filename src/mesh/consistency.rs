@@ -38,7 +38,7 @@ fn neighbours(views: &[DepthView], of: usize, count: usize) -> Vec<usize> {
     others.into_iter().take(count).map(|(_, k)| k).collect()
 }
 
-/// Of each pixel, whether the neighbours confirm it at least as often as they contradict it.
+/// Of each pixel, whether the neighbours confirm it at least as often as they contradict it. What no other view saw is kept.
 fn confirmed(views: &[DepthView], of: usize, config: &MeshConfig) -> Vec<bool> {
     let view = &views[of];
     let others: Vec<_> = neighbours(views, of, config.neighbours)
@@ -66,7 +66,7 @@ fn confirmed(views: &[DepthView], of: usize, config: &MeshConfig) -> Vec<bool> {
             agree += usize::from(through.abs() <= tolerance);
             against += usize::from(through > tolerance);
         }
-        agree >= against && (agree > 0 || others.is_empty())
+        agree >= against
     };
     view.inverse_depth.iter().enumerate().map(vote).collect()
 }

@@ -98,7 +98,8 @@ fn linear(value: u8) -> u16 {
 fn glb(mesh: &Mesh, path: &Path) -> Result<Vec<u8>, MeshError> {
     let turned: Vec<[f32; 3]> = mesh.vertices.iter().map(|p| [p.x, -p.y, -p.z]).collect();
     let to_linear: [u16; 256] = std::array::from_fn(|v| linear(v as u8));
-    let colors = mesh.colors.iter().flat_map(|c| [to_linear[c[0] as usize], to_linear[c[1] as usize], to_linear[c[2] as usize], u16::MAX]);
+    let colors =
+        mesh.colors.iter().flat_map(|c| [to_linear[c[0] as usize], to_linear[c[1] as usize], to_linear[c[2] as usize], u16::MAX]);
     let parts = [
         turned.iter().flatten().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>(),
         colors.flat_map(u16::to_le_bytes).collect(),
@@ -138,5 +139,6 @@ fn glb(mesh: &Mesh, path: &Path) -> Result<Vec<u8>, MeshError> {
     let too_large = || MeshError::TooLargeForFormat { path: path.into(), reason: "a GLB has at most 4 GiB" };
     let length = u32::try_from(28 + text.len() + binary.len()).map_err(|_| too_large())?;
     let chunk = |kind: &[u8; 4], body: &[u8]| [&(body.len() as u32).to_le_bytes(), kind.as_slice(), body].concat();
-    Ok([b"glTF".as_slice(), &2u32.to_le_bytes(), &length.to_le_bytes(), &chunk(b"JSON", &text), &chunk(b"BIN\0", &binary)].concat())
+    Ok([b"glTF".as_slice(), &2u32.to_le_bytes(), &length.to_le_bytes(), &chunk(b"JSON", &text), &chunk(b"BIN\0", &binary)]
+        .concat())
 }

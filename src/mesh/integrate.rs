@@ -93,10 +93,11 @@ impl<'a> Projection<'a> {
         let ray = (1.0 + n[0] * n[0] + n[1] * n[1]).sqrt();
         let along = (inverse.recip() - p[2]) * ray;
         let distance = along * facing;
-        if facing == 0.0 || distance < -self.truncation || distance > self.truncation {
+        // Behind the surface the ray's own length counts: a flat ray would else reach what lies far behind a rim.
+        if facing == 0.0 || along < -self.truncation || distance > self.truncation {
             return;
         }
-        let behind = (1.0 + distance.min(0.0) / self.truncation).max(0.0);
+        let behind = (1.0 + along.min(0.0) / self.truncation).max(0.0);
         let weight = facing * inverse * inverse * behind;
         if weight <= 0.0 {
             return;

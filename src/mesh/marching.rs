@@ -61,8 +61,7 @@ fn locals() -> impl Iterator<Item = [usize; 3]> {
 /// The triangles where the distance is zero, between voxels that at least `min_views` views saw.
 pub(super) fn extract(volume: &Volume, min_views: u16) -> Mesh {
     let around = |block: &Block| Around::new(volume, block.key, min_views);
-    let owned: Vec<Vec<Vertex>> =
-        volume.blocks.par_iter().map(|block| vertices(volume, block, &around(block))).collect();
+    let owned: Vec<Vec<Vertex>> = volume.blocks.par_iter().map(|block| vertices(volume, block, &around(block))).collect();
     let mut first = Vec::with_capacity(owned.len());
     let mut total = 0u32;
     for vertices in &owned {
@@ -112,9 +111,8 @@ fn triangles(around: &Around<'_>, owned: &[Vec<Vertex>], first: &[u32], steepest
         let Some(inside) = (0..CORNERS).map(bit).sum::<Option<usize>>() else { continue };
         let cell = &CELLS[inside];
         let distance = |c: usize| corners[c].map_or(0.0, |voxel| voxel.distance);
-        let is_steep = |edge: &super::tables::Edge| {
-            (distance(edge.corner) - distance(edge.corner | 1 << edge.axis)).abs() > steepest
-        };
+        let is_steep =
+            |edge: &super::tables::Edge| (distance(edge.corner) - distance(edge.corner | 1 << edge.axis)).abs() > steepest;
         if cell.iter().flatten().any(is_steep) {
             continue;
         }

@@ -77,7 +77,9 @@ impl Mesh {
 #[derive(Debug, thiserror::Error)]
 pub enum MeshError {
     /// There is nothing to fuse.
-    #[error("no view has depth that the others confirm, so there is no surface; raise --tolerance, or map the recording with more keyframes")]
+    #[error(
+        "no view has depth that the others confirm, so there is no surface; raise --tolerance, or map the recording with more keyframes"
+    )]
     Empty,
     /// A setting is out of its range.
     #[error("--{option} is {value}; {advice}")]
@@ -104,7 +106,9 @@ pub enum MeshError {
         fits: f64,
     },
     /// The views alone do not fit.
-    #[error("the depth of {views} views needs {needed_mib} MiB, more than --max-memory; raise it, or take fewer views with --every")]
+    #[error(
+        "the depth of {views} views needs {needed_mib} MiB, more than --max-memory; raise it, or take fewer views with --every"
+    )]
     TooManyViews {
         /// Number of views.
         views: usize,

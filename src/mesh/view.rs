@@ -113,7 +113,8 @@ impl DepthView {
     /// Inverse depth between pixels: bilinear on one surface, else of the nearest pixel; 0 where nothing is known.
     pub(super) fn sample(&self, u: f32, v: f32) -> f32 {
         let (x, y) = (u.floor() as isize, v.floor() as isize);
-        let corners = [self.inverse_at(x, y), self.inverse_at(x + 1, y), self.inverse_at(x, y + 1), self.inverse_at(x + 1, y + 1)];
+        let corners =
+            [self.inverse_at(x, y), self.inverse_at(x + 1, y), self.inverse_at(x, y + 1), self.inverse_at(x + 1, y + 1)];
         let (low, high) = (corners.iter().copied().fold(f32::MAX, f32::min), corners.iter().copied().fold(0.0, f32::max));
         let (s, t) = (u - x as f32, v - y as f32);
         if low > 0.0 && high - low < 2.0 * EDGE * low {

@@ -83,8 +83,8 @@ pub(super) fn fitting_blocks(views: &[DepthView], config: &MeshConfig, bytes: u6
         fits.voxel_metres *= COARSER;
     }
     // Two digits, upwards: a size that somebody may type.
-    let digit = 10f64.powf(fits.voxel_metres.log10().floor() - 1.0);
-    let rounded = (fits.voxel_metres / digit).ceil() / digit.recip().round().max(1.0);
+    let digits = 1.0 - fits.voxel_metres.log10().floor();
+    let rounded = (fits.voxel_metres * 10f64.powf(digits)).ceil() / 10f64.powf(digits);
     let mib = |blocks: u64| (blocks * BLOCK_BYTES).div_ceil(1 << 20);
     Err(MeshError::TooLarge {
         voxel: config.voxel_metres,

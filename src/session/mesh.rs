@@ -18,7 +18,7 @@ use crate::sequence::{RectifiedImage, Rectifiers};
 use crate::splat::ViewCamera;
 
 /// The map's depth is taken where it covers so much of a pixel.
-const LEAST_ALPHA: f32 = 0.9;
+const LEAST_ALPHA: f32 = 0.5;
 /// Without the recording, views have this size and this horizontal field of view, degrees.
 const UNKNOWN: (u32, u32, f64) = (640, 480, 60.0);
 
@@ -108,7 +108,8 @@ fn open_recording(folder: &Path, options: &MeshOptions) -> Result<Option<Recordi
         config.sequence.get_or_insert_default().path.clone_from(path);
         return Ok(Some(Recording::open(config)?));
     }
-    let recording = config.and_then(|config| Recording::open(config).map_err(|error| tracing::warn!("without the recording: {error}")).ok());
+    let recording =
+        config.and_then(|config| Recording::open(config).map_err(|error| tracing::warn!("without the recording: {error}")).ok());
     Ok(recording)
 }
 
