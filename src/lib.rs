@@ -14,6 +14,7 @@ pub mod geometry;
 pub mod gpu;
 pub mod inspection;
 pub mod mapping;
+pub mod mesh;
 pub mod optimise;
 pub mod pipeline;
 pub mod presets;

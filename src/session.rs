@@ -2,17 +2,22 @@
 
 mod dataset;
 mod evaluate;
+mod mesh;
+mod mesh_errors;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 pub use dataset::{DatasetCounts, DatasetOptions, DatasetViews, export_dataset};
 pub use evaluate::{EvaluateOptions, evaluate_folder};
+pub use mesh::{FusedMesh, MeshOptions, mesh_folder};
+pub use mesh_errors::{MeshReport, MeshTruthOptions, evaluate_mesh};
 
 use crate::config::Config;
 use crate::evaluation::Metrics;
 use crate::geometry::TrajectoryError;
 use crate::gpu::{Gpu, GpuError};
+use crate::mesh::MeshError;
 use crate::pipeline::{self, PipelineError, Progress, Replay};
 use crate::recording::{Recording, RecordingError};
 use crate::run_folder::outputs::{self, EvaluationInput};
@@ -68,6 +73,17 @@ pub enum SessionError {
     /// A trajectory cannot be read.
     #[error(transparent)]
     Trajectory(#[from] TrajectoryError),
+    /// A mesh cannot be made.
+    #[error(transparent)]
+    Mesh(#[from] MeshError),
+    /// Measured depth was asked for.
+    #[error(
+        "the recording of {folder} has no measured depth at its poses; leave --depth out, or name the recording with --sequence"
+    )]
+    NoMeasuredDepth {
+        /// The run's folder.
+        folder: PathBuf,
+    },
     /// A file of a run's folder is missing.
     #[error("there is no file {path}; {advice}")]
     Missing {
@@ -105,6 +121,14 @@ pub enum SessionError {
         seconds: f64,
         /// Name of the recording.
         recording: String,
+    },
+    /// A run that cannot be led to the truth.
+    #[error("the run in {folder} cannot be aligned with a truth: {reason}")]
+    NoAlignment {
+        /// The run's folder.
+        folder: PathBuf,
+        /// The cause.
+        reason: String,
     },
     /// A resumed run's recording has moved.
     #[error("the recording is no longer at {path}; name its new place with --sequence")]

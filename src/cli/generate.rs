@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use indicatif::ProgressBar;
+use keysplat::mesh::MeshFormat;
 use keysplat::synthetic::{self, SceneConfig};
 use miette::IntoDiagnostic;
 
@@ -14,13 +15,20 @@ pub struct GenerateArgs {
     /// Scene description (see `sequences/`).
     scene: PathBuf,
     /// Folder to write the recording to, in TUM's layout.
-    #[arg(short, long)]
-    out: PathBuf,
+    #[arg(short, long, required_unless_present = "surface")]
+    out: Option<PathBuf>,
+    /// Mesh to write the exact surface to, as far as the camera sees it: .ply, .glb or .obj.
+    #[arg(long)]
+    surface: Option<PathBuf>,
 }
 
 pub fn generate(args: &GenerateArgs, verbosity: Verbosity) -> miette::Result<()> {
     let scene = SceneConfig::read(&args.scene).into_diagnostic()?;
-    render(&scene, &args.out, verbosity)
+    if let Some(path) = &args.surface {
+        let format = MeshFormat::of_path(path).into_diagnostic()?;
+        format.write(&synthetic::visible_surface(&scene).into_diagnostic()?, path).into_diagnostic()?;
+    }
+    args.out.as_ref().map_or(Ok(()), |out| render(&scene, out, verbosity))
 }
 
 /// Renders a scene with a progress bar.

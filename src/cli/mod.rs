@@ -6,9 +6,11 @@ mod calibrate;
 mod check;
 mod demo;
 mod eval;
+mod eval_mesh;
 mod export;
 mod generate;
 mod keys;
+mod mesh;
 mod progress;
 mod render;
 mod report;
@@ -63,8 +65,12 @@ enum Command {
     Generate(generate::GenerateArgs),
     /// Measure a finished run, of ours or anybody's.
     Eval(eval::EvalArgs),
+    /// Measure a mesh against a true surface.
+    EvalMesh(eval_mesh::EvalMeshArgs),
     /// Write a map in another file format, whole or in part.
     Export(export::ExportArgs),
+    /// Write the surface of a finished run as a triangle mesh.
+    Mesh(mesh::MeshArgs),
     /// Draw a finished run as one HTML file that needs nothing else.
     Report(report::ReportArgs),
     /// Render a moving picture of a finished run's map.
@@ -117,7 +123,9 @@ fn execute(command: Command, verbosity: Verbosity) -> miette::Result<()> {
         Command::Demo(args) => demo::demo(&args, verbosity),
         Command::Generate(args) => generate::generate(&args, verbosity),
         Command::Eval(args) => eval::eval(&args, verbosity),
+        Command::EvalMesh(args) => eval_mesh::eval_mesh(&args, verbosity),
         Command::Export(args) => export::export(&args, verbosity),
+        Command::Mesh(args) => mesh::mesh(&args, verbosity),
         Command::Report(args) => report::report(&args, verbosity),
         Command::Render(args) => render::render(&args, verbosity),
         Command::View(args) => view::view(&args, verbosity),

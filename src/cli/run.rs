@@ -92,7 +92,7 @@ fn absolute(path: &str) -> miette::Result<String> {
     Ok(std::path::absolute(path).into_diagnostic()?.to_string_lossy().into_owned())
 }
 
-fn parse_bytes(text: &str) -> Result<u64, String> {
+pub fn parse_bytes(text: &str) -> Result<u64, String> {
     let digits = text.trim_end_matches(|c: char| !c.is_ascii_digit());
     let unit: u64 = match text[digits.len()..].to_ascii_uppercase().as_str() {
         "" | "B" => 1,

@@ -121,7 +121,7 @@ fn exposures(folder: &Path) -> Result<Exposures, SessionError> {
     Exposures::parse(&text).ok_or_else(|| unreadable(&path, advice))
 }
 
-fn earlier_metrics(folder: &Path) -> Result<Option<Metrics>, SessionError> {
+pub(super) fn earlier_metrics(folder: &Path) -> Result<Option<Metrics>, SessionError> {
     let path = folder.join(outputs::METRICS);
     if !path.is_file() {
         return Ok(None);

@@ -8,6 +8,7 @@
 mod bvh;
 mod config;
 mod degrade;
+mod exact;
 mod furniture;
 mod light;
 mod noise;
@@ -32,6 +33,7 @@ use sha2::{Digest, Sha256};
 use crate::geometry::{Camera, Distortion, Pinhole, Se3, StampedPose, Trajectory};
 
 pub use config::{CameraConfig, DegradationConfig, FurnitureConfig, PathConfig, PathKind, RoomConfig, SceneConfig};
+pub use exact::visible_surface;
 
 use path::CameraPath;
 use render::{Moment, Rendered, Renderer};

@@ -273,3 +273,34 @@ fn shipped_scenes_can_be_built() {
         assert!(speed < most && turn < fastest, "{}: {speed} m/s, {turn} degrees/s", scene.display());
     }
 }
+
+/// Every corner of the exact surface lies on a solid, and the surface is where the camera's own depth is.
+#[test]
+fn the_exact_surface_is_what_the_camera_measures() {
+    let camera = CameraConfig { width: 64, height: 48, fx: 52.5, fy: 52.5, cx: 31.5, cy: 23.5, ..CameraConfig::default() };
+    let config = SceneConfig { frames: 12, camera, ..SceneConfig::default() };
+    let surface = visible_surface(&config).unwrap();
+    let (recording, plan) = (Recording::new(&config).unwrap(), Plan::new(&config).unwrap());
+    let near = |p: glam::DVec3| {
+        plan.solids.iter().any(|solid| {
+            let q = solid.to_local(p);
+            // Ellipsoids are measured along the ray to their centre.
+            match solid.shape {
+                shapes::Shape::Ellipsoid { radii } => (1.0 - (q / radii).length()).abs() * radii.max_element() < 1e-4,
+                shapes::Shape::Shell { .. } => solid.distance(p) < 1e-4,
+                _ => (solid.distance(p) < 1e-4) && !solid.contains(solid.to_world(q * (1.0 + 1e-3))),
+            }
+        })
+    };
+    let off: Vec<glam::Vec3> = surface.vertices.iter().step_by(97).copied().filter(|p| !near(p.as_dvec3())).collect();
+    assert!(off.is_empty(), "on no surface: {off:?}");
+    let (depth, pose) = (recording.render(6).geometry, recording.path.world_from_camera(recording.time_s(6)));
+    let pinhole = config.camera().pinhole;
+    let pixels = (0..64 * 48).step_by(61).map(|i| (i, nalgebra::Vector2::new(f64::from(i % 64), f64::from(i / 64))));
+    for (i, pixel) in pixels {
+        let p = pose * nalgebra::Point3::from(pinhole.unproject(&pixel, f64::from(depth[i as usize].depth_metres)));
+        let p = glam::Vec3::new(p.x as f32, p.y as f32, p.z as f32);
+        let nearest = surface.vertices.iter().map(|q| q.distance(p)).fold(f32::INFINITY, f32::min);
+        assert!(nearest < 0.025, "{p} is {nearest} m from the surface's nearest corner");
+    }
+}

@@ -9,11 +9,12 @@ use std::path::{Path, PathBuf};
 const EVERYTHING_ABOVE: &[&str] = &["*"];
 
 /// A module, and the modules whose items it may name. `verification` is in no list but the command line's: production does not use the oracle.
-const ALLOWED: [(&str, &[&str]); 25] = [
+const ALLOWED: [(&str, &[&str]); 26] = [
     ("files", &[]),
     ("geometry", &[]),
     ("sequence", &["geometry"]),
-    ("synthetic", &["geometry"]),
+    ("mesh", &["files", "geometry"]),
+    ("synthetic", &["geometry", "mesh"]),
     ("splat", &["geometry"]),
     ("tracking", &["geometry", "sequence"]),
     ("gpu", &[]),
@@ -81,6 +82,8 @@ const ALLOWED: [(&str, &[&str]); 25] = [
             "recording",
             "run_folder",
             "pipeline",
+            "mesh",
+            "render",
         ],
     ),
     ("verification", &["geometry", "sequence", "splat", "tracking", "gpu", "render", "optimise"]),
@@ -91,7 +94,7 @@ const ALLOWED: [(&str, &[&str]); 25] = [
 const OF_THE_WHOLE_RUN: [&str; 4] = ["config", "run_folder", "pipeline", "cli"];
 
 /// Modules that must build and run without a GPU.
-const WITHOUT_WGPU: [&str; 7] = ["files", "geometry", "sequence", "synthetic", "splat", "tracking", "export"];
+const WITHOUT_WGPU: [&str; 8] = ["files", "geometry", "sequence", "mesh", "synthetic", "splat", "tracking", "export"];
 
 const MAX_LINES: usize = 400;
 

@@ -9,6 +9,7 @@ use fastrand::Rng;
 use keysplat::config::Config;
 use keysplat::export::MapFormat;
 use keysplat::geometry::Trajectory;
+use keysplat::mesh::Mesh;
 use keysplat::sequence::Layout;
 use keysplat::synthetic::SceneConfig;
 use keysplat::viewing::FromViewer;
@@ -58,6 +59,7 @@ fn parse(target: &str, bytes: &[u8]) -> usize {
             Some(FromViewer::Render(request)) => request.camera().is_some(),
             message => message.is_some(),
         })),
+        (_, "meshes") => usize::from(Mesh::decode(bytes, path).is_ok()),
         (_, "scene") => usize::from(text().is_some_and(|text| SceneConfig::parse(text, path).is_ok())),
         _ => panic!("the corpus {target} has no parser here"),
     }

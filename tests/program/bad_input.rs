@@ -252,12 +252,12 @@ fn folders_to_evaluate() {
 
 /// A small disk of its own, taken away again when the test ends.
 #[cfg(target_os = "linux")]
-struct SmallDisk(tempfile::TempDir);
+pub(crate) struct SmallDisk(pub(crate) tempfile::TempDir);
 
 #[cfg(target_os = "linux")]
 impl SmallDisk {
     /// `None` where mounting is not allowed.
-    fn mount(size: &str) -> Option<Self> {
+    pub(crate) fn mount(size: &str) -> Option<Self> {
         let folder = tempfile::tempdir().unwrap();
         let options = ["-t", "tmpfs", "-o", &format!("size={size}"), "tmpfs"];
         let mounted = std::process::Command::new("mount").args(options).arg(folder.path()).output();

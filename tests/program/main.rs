@@ -12,6 +12,7 @@ mod faults;
 mod film;
 mod interaction;
 mod known_poses;
+mod mesh;
 mod quality;
 mod report;
 mod resume;

@@ -1,0 +1,90 @@
+//! `keysplat mesh`, `keysplat eval-mesh` and `keysplat generate --surface`: from a run to the errors of its surface.
+
+use std::path::{Path, PathBuf};
+
+use keysplat::mesh::Mesh;
+
+use crate::common::recording::{finish, keysplat, recording, run_command, scratch, skipped_without_adapter};
+
+/// The run's mesh in a file of the scratch folder, with more options.
+fn mesh(run: &Path, name: &str, more: &[&str]) -> (crate::common::recording::Finished, PathBuf) {
+    let file = scratch().join(name);
+    let mut command = keysplat(["mesh".as_ref(), run.as_os_str(), file.as_os_str()]);
+    command.args(["--voxel", "0.03"]).args(more);
+    (finish(command), file)
+}
+
+#[test]
+fn a_run_becomes_a_mesh_near_the_true_surface() {
+    if skipped_without_adapter() {
+        return;
+    }
+    let (out, truth) = (scratch().join("run"), scratch().join("truth.ply"));
+    finish(run_command(recording(), &out, &[])).succeeded();
+    let scene = recording().join("scene.toml");
+    finish(keysplat(["generate".as_ref(), scene.as_os_str(), "--surface".as_ref(), truth.as_os_str()])).succeeded();
+    let errors = |file: &Path| {
+        let mut command = keysplat(["eval-mesh".as_ref(), file.as_os_str(), "--truth".as_ref(), truth.as_os_str()]);
+        command.arg("--run").arg(&out).args(["--log", "json"]);
+        serde_json::from_str::<serde_json::Value>(&finish(command).succeeded().stdout).unwrap()
+    };
+    let (said, file) = mesh(&out, "measured.ply", &["--depth", "measured", "--all-frames"]);
+    let said = said.succeeded().stdout;
+    assert!(said.contains("24 views, 24 with measured depth"), "{said}");
+    let report = errors(&file);
+    let f1 = |report: &serde_json::Value, k: usize| report["shares"][k]["f1"].as_f64().unwrap();
+    assert!(f1(&report, 2) > 0.85 && f1(&report, 1) > 0.7, "{report}");
+    assert!(
+        report["depth"]["depth_l1_m"].as_f64().unwrap() < 0.02 && report["depth"]["seen_share"].as_f64().unwrap() > 0.8,
+        "{report}"
+    );
+    let (said, rendered) = mesh(&out, "rendered.ply", &["--depth", "rendered", "--all-frames"]);
+    assert!(said.succeeded().stdout.contains("24 views, 0 with measured depth"));
+    let report = errors(&rendered);
+    assert!(f1(&report, 2) > 0.4, "from a map of few steps: {report}");
+
+    let (_, again) = mesh(&out, "again.ply", &["--depth", "measured", "--all-frames"]);
+    let bytes = |file: &Path| std::fs::read(file).unwrap();
+    assert!(bytes(&file) == bytes(&again), "the same mesh to the bit");
+    let (whole, simple) =
+        (Mesh::read(&file).unwrap(), mesh(&out, "simple.ply", &["--depth", "measured", "--all-frames", "--simplify", "0.3"]).1);
+    let simple = Mesh::read(&simple).unwrap();
+    assert!(simple.triangles.len() * 2 < whole.triangles.len() && simple.area() > 0.9 * whole.area());
+    for name in ["m.glb", "m.obj"] {
+        mesh(&out, name, &[]).0.succeeded();
+        assert!(bytes(&scratch().join(name)).len() > 10_000);
+    }
+    refusals(&out);
+}
+
+/// What is wrong ends in an error that says what to do, and in no file.
+fn refusals(out: &Path) {
+    let refused = |name: &str, more: &[&str], parts: &[&str]| {
+        let (said, file) = mesh(out, name, more);
+        said.refused(parts);
+        assert!(!file.exists(), "{}", file.display());
+    };
+    refused("x.stl", &[], &["x.stl", ".ply, .glb or .obj"]);
+    refused("x.ply", &["--tolerance", "0"], &["--tolerance is 0", "0.0001 to 1"]);
+    refused("x.ply", &["--max-memory", "12M"], &["--max-memory", "--voxel", "fits"]);
+    refused("x.ply", &["--max-memory", "1M"], &["--every"]);
+    refused("x.ply", &["--adapter", "nobody's"], &["nobody's"]);
+    refused("nowhere/x.ply", &[], &["nowhere/x.ply", "create the folder first"]);
+    #[cfg(target_os = "linux")]
+    if let Some(disk) = super::bad_input::SmallDisk::mount("64k") {
+        let file = disk.0.path().join("x.ply");
+        finish(keysplat(["mesh".as_ref(), out.as_os_str(), file.as_os_str()])).refused(&["x.ply", "free some space"]);
+        assert_eq!(std::fs::read_dir(disk.0.path()).unwrap().count(), 0);
+    }
+    let config = std::fs::read_to_string(out.join("config.toml")).unwrap();
+    std::fs::write(out.join("config.toml"), config.replace(recording().to_str().unwrap(), "/nowhere/else")).unwrap();
+    refused("x.ply", &["--depth", "measured"], &["no measured depth", "--sequence"]);
+    mesh(out, "without-recording.ply", &["--min-component", "0"]).0.succeeded();
+    std::fs::remove_file(out.join("keyframes.txt")).unwrap();
+    refused("x.ply", &[], &["keyframes.txt", "--all-frames"]);
+    std::fs::remove_file(out.join("map.ply")).unwrap();
+    refused("x.ply", &[], &["map.ply", "give the folder of a run"]);
+    let no_mesh =
+        finish(keysplat(["eval-mesh".as_ref(), out.join("config.toml").as_os_str(), "--truth".as_ref(), out.as_os_str()]));
+    no_mesh.refused(&["config.toml", "PLY"]);
+}
