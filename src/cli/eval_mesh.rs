@@ -45,24 +45,23 @@ fn text(report: &MeshReport) -> String {
     let centimetres = |metres: f64| format!("{:.2} cm", 100.0 * metres);
     let percent = |share: f64| format!("{:.2} %", 100.0 * share);
     let mut lines = vec![
-        ("accuracy", centimetres(errors.accuracy_m)),
-        ("completion", centimetres(errors.completion_m)),
-        ("completion < 5 cm", percent(errors.completion_ratio)),
+        ("accuracy".to_owned(), centimetres(errors.accuracy_m)),
+        ("completion".to_owned(), centimetres(errors.completion_m)),
+        ("completion < 5 cm".to_owned(), percent(errors.completion_ratio)),
     ];
     for share in &errors.shares {
         let of = format!("(precision {}, recall {})", percent(share.precision), percent(share.recall));
-        let name =
-            ["F1 at 1 cm", "F1 at 2 cm", "F1 at 5 cm"][usize::from(share.within_m > 0.01) + usize::from(share.within_m > 0.02)];
+        let name = format!("F1 at {:.0} cm", 100.0 * share.within_m);
         lines.push((name, format!("{}   {of}", percent(share.f1))));
     }
     if let Some(depth) = &report.depth {
         lines.push((
-            "depth L1",
+            "depth L1".to_owned(),
             format!("{}   ({} views, {} seen)", centimetres(depth.depth_l1_m), depth.views, percent(depth.seen_share)),
         ));
     }
     if let Some(by) = report.refined_by_m {
-        lines.push(("moved by ICP", centimetres(by)));
+        lines.push(("moved by ICP".to_owned(), centimetres(by)));
     }
     lines.into_iter().map(|(name, value)| format!("{name:<20}  {value}\n")).collect()
 }

@@ -66,8 +66,8 @@ fn refusals(out: &Path) {
     };
     refused("x.stl", &[], &["x.stl", ".ply, .glb or .obj"]);
     refused("x.ply", &["--tolerance", "0"], &["--tolerance is 0", "0.0001 to 1"]);
-    refused("x.ply", &["--max-memory", "12M"], &["--max-memory", "--voxel", "fits"]);
-    refused("x.ply", &["--max-memory", "1M"], &["--every"]);
+    refused("x.ply", &["--max-memory", "2M"], &["--max-memory", "--voxel", "fits"]);
+    refused("x.ply", &["--max-memory", "1M", "--all-frames"], &["--every"]);
     refused("x.ply", &["--adapter", "nobody's"], &["nobody's"]);
     refused("nowhere/x.ply", &[], &["nowhere/x.ply", "create the folder first"]);
     #[cfg(target_os = "linux")]
