@@ -188,7 +188,7 @@ mod tests {
         }
         let palette = Palette::new(&map, &cameras);
         let entries = palette.entries.len() / 9;
-        assert!((3..=512).contains(&entries), "{entries}");
+        assert!((3..=832).contains(&entries), "{entries}");
         for i in 0..map.len() {
             let entry = &palette.entries[9 * usize::from(palette.labels[i])..][..9];
             let seen = Seen::new(map.means[i], &cameras);
