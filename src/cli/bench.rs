@@ -33,9 +33,9 @@ enum What {
     /// One training step, on made-up scenes or on the map of a run, stage by stage, beside what the adapter could do at its best.
     Step(StepArgs),
     /// CPU time of the mapping thread for a keyframe by part, and what passes between it and the adapter.
-    Host(Box<host::HostArgs>),
+    Host(host::HostArgs),
     /// Mappers with different settings on the same keyframes of a recording: time, Gaussians, held-out quality.
-    Ablation(ablation::AblationArgs),
+    Ablation(Box<ablation::AblationArgs>),
     /// Whole runs over sequences, numbers of steps and seeds: what time buys, as table and curves.
     Sweep(sweep::SweepArgs),
     /// The tracker on many replays of recordings: start frames, directions, missing frames; distributions of its errors.

@@ -84,8 +84,10 @@ impl Seen {
     pub fn constant(&self, wanted: &Coefficients, found: &Coefficients) -> f64 {
         let mut found = *found;
         found[0] = wanted[0];
+        let mut best = (self.error(wanted, &found), found[0]);
+        // First as if nothing were drawn black.
+        let mut targets: Vec<f64> = self.colors(wanted).collect();
         for _ in 0..ROUNDS {
-            let targets = self.targets(wanted, &found);
             // Views that stay black have no say.
             let (mut missing, mut views) = (0.0, 0u32);
             for (target, color) in targets.into_iter().zip(self.colors(&found)).filter(|(target, color)| target != color) {
@@ -93,8 +95,18 @@ impl Seen {
                 views += 1;
             }
             found[0] += missing / (f64::from(views.max(1)) * f64::from(sh::SH_C0));
+            let error = self.error(wanted, &found);
+            if error < best.0 {
+                best = (error, found[0]);
+            }
+            targets = self.targets(wanted, &found);
         }
-        found[0]
+        best.1
+    }
+
+    /// Sum of the squared differences of what is drawn.
+    fn error(&self, wanted: &Coefficients, found: &Coefficients) -> f64 {
+        self.colors(wanted).zip(self.colors(found)).map(|(a, b)| (a.max(0.0) - b.max(0.0)).powi(2)).sum()
     }
 
     /// The coefficients within the bounds that are drawn most like `wanted`, and are near it where nobody looks.

@@ -126,7 +126,7 @@ mod tests {
         assert!(refusal(16, &u32::MAX.to_le_bytes()).contains("cut off"));
         assert!(refusal(32, &u64::MAX.to_le_bytes()).contains("cut off"));
         assert!(refusal(40, &u64::MAX.to_le_bytes()).contains("another length"));
-        assert!(refusal(140, &[0; 8]).contains("cannot be unpacked"));
+        assert!(refusal(128, &[0; 8]).contains("cannot be unpacked"));
         assert!(read(&[bytes.clone(), vec![0]].concat()).unwrap_err().to_string().contains("bytes follow"));
     }
 }

@@ -137,6 +137,23 @@ fn gzip(bytes: &[u8]) -> Vec<u8> {
     encoder.finish().unwrap()
 }
 
+/// A zip whose description promises `count` Gaussians, and names files outside of it.
+fn sog(count: u64) -> Vec<u8> {
+    let mut zip = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
+    let options = zip::write::SimpleFileOptions::default().compression_method(zip::CompressionMethod::Deflated);
+    let one = |file: &str| serde_json::json!({ "codebook": [0.0], "files": [file] });
+    let meta = serde_json::json!({
+        "version": 2, "count": count, "scales": one("/etc/passwd"), "sh0": one("../x"), "quats": one("x"),
+        "means": { "mins": [0, 0, 0], "maxs": [1, 1, 1], "files": ["../../x", "x"] },
+    });
+    zip.start_file("meta.json", options).unwrap();
+    std::io::Write::write_all(&mut zip, meta.to_string().as_bytes()).unwrap();
+    // As long as an honest file, and compressed to nothing.
+    zip.start_file("x", options).unwrap();
+    std::io::Write::write_all(&mut zip, &vec![0; 32 << 20]).unwrap();
+    zip.finish().unwrap().into_inner()
+}
+
 #[test]
 fn lying_headers_cost_no_memory() {
     let names = [
@@ -150,6 +167,10 @@ fn lying_headers_cost_no_memory() {
         let promised = (count as u32).max(1 << 31).to_le_bytes();
         let spz = [&0x5053_474eu32.to_le_bytes()[..], &3u32.to_le_bytes(), &promised, &[3, 12, 0, 0], &[0; 4096]].concat();
         assert_eq!(parse("spz", &gzip(&spz)), 0);
+        let spz4 =
+            [&0x5053_474eu32.to_le_bytes()[..], &4u32.to_le_bytes(), &promised, &[3, 12, 0, 6], &32u32.to_le_bytes()].concat();
+        assert_eq!(parse("spz4", &[&spz4[..], &[0; 4096]].concat()), 0);
+        assert_eq!(parse("sog", &sog(count)), 0);
         for stride in [12, u64::MAX] {
             let names = ["POSITION", "ROTATION", "SCALE", "OPACITY", "SH_DEGREE_0_COEF_0"];
             let kinds = ["VEC3", "VEC4", "VEC3", "SCALAR", "VEC3"];

@@ -3,7 +3,8 @@
 use std::path::{Path, PathBuf};
 
 use crate::common::recording::{
-    FRAMES, HEIGHT, WIDTH, copy_of_recording, finish, metrics, recording, run_command, scratch, skipped_without_adapter, stamps,
+    FRAMES, HEIGHT, WIDTH, copy_of_recording, finish, keysplat, metrics, recording, run_command, scratch,
+    skipped_without_adapter, stamps,
 };
 use image::imageops::{FilterType, resize};
 use image::{GrayImage, ImageBuffer, Luma, Rgb};
@@ -83,6 +84,38 @@ fn photos_are_mapped_from_points_whatever_their_unit() {
     });
     // Cubes of points are powers of two of the unit, so the two maps begin with a tenth more or fewer points.
     assert!(psnr[0] > 24.0 && (psnr[0] - psnr[1]).abs() < 1.0, "{psnr:?}");
+}
+
+/// Whatever the format: a map given back begins where it ended, and not from points.
+#[test]
+fn an_exported_map_given_back_starts_at_its_own_quality() {
+    let photos = colmap("given-back", 1.0);
+    let few = |name: &str, more: &[&str]| {
+        let out = scratch().join(name);
+        let options = ["--known-poses", "--set", "mapping.refine.steps=2", "--set", "mapping.refine.density_every=20"];
+        finish(run_command(&photos, &out, &[&options, more].concat()))
+    };
+    let damaged = scratch().join("damaged.sog");
+    std::fs::write(&damaged, b"PK and no more").unwrap();
+    few("of-damage", &["--initial-map", damaged.to_str().unwrap()]).refused(&["initial map", "damaged.sog", "no whole zip"]);
+    few("of-nothing", &["--initial-map", "nothing.ply"]).refused(&["nothing.ply"]);
+    let tracked = ["--set", "initial_map=x.ply"];
+    finish(run_command(&photos, &scratch().join("tracked"), &tracked)).refused(&["known poses"]);
+    if skipped_without_adapter() {
+        return;
+    }
+    let psnr = |out: &Path| metrics(out).images.held_out.unwrap().psnr_db.unwrap();
+    let first = run("given", &photos);
+    few("from-points", &[]).succeeded();
+    let from_points = psnr(&scratch().join("from-points"));
+    for format in ["ply", "spz", "sog"] {
+        let map = scratch().join("given").with_extension(format);
+        finish(keysplat(["export".as_ref(), first.as_os_str(), map.as_os_str()])).succeeded();
+        let name = format!("from-{format}");
+        few(&name, &["--initial-map", map.to_str().unwrap()]).succeeded();
+        let from_map = psnr(&scratch().join(name));
+        assert!(from_map > psnr(&first) - 0.5 && from_map > from_points + 1.0, "{format}: {from_map}, from points {from_points}");
+    }
 }
 
 /// The photos of [`colmap`], every second one at half its size with a camera of its own.

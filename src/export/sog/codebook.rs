@@ -54,7 +54,7 @@ fn lloyd(sorted: &[f32]) -> Vec<f32> {
     for _ in 0..ROUNDS {
         ends.dedup();
         values = ends.windows(2).map(|stretch| mean(stretch[0], stretch[1])).collect::<Vec<f32>>();
-        let middle = |pair: &[f32]| sorted.partition_point(|number| *number < pair[0] + 0.5 * (pair[1] - pair[0]));
+        let middle = |pair: &[f32]| sorted.partition_point(|number| *number < 0.5 * pair[0] + 0.5 * pair[1]);
         let inner = values.windows(2).map(middle);
         let next: Vec<usize> = std::iter::once(0).chain(inner).chain([sorted.len()]).collect();
         if next == ends {

@@ -13,7 +13,7 @@ use crate::geometry::Se3;
 use crate::splat::{GaussianCloud, opacity_from_raw};
 
 /// Gaussians that share an entry, on average: an entry costs about as many bytes as so many labels.
-const GAUSSIANS_PER_ENTRY: usize = 6;
+const GAUSSIANS_PER_ENTRY: f64 = 5.5;
 /// Labels have 16 bits.
 pub(super) const MOST_ENTRIES: usize = 1 << 16;
 /// Weight of harmonics themselves beside the colours in a view: they are smaller then where nobody looks. Much to find like ones, and
@@ -35,7 +35,7 @@ impl Palette {
     /// The palette of a map whose harmonics go beyond the constant one.
     pub fn new(cloud: &GaussianCloud, cameras: &[Se3]) -> Self {
         let dimensions = 3 * (cloud.sh_degree.coefficients() - 1);
-        let wanted = (cloud.len() / GAUSSIANS_PER_ENTRY).next_multiple_of(64).min(MOST_ENTRIES);
+        let wanted = ((cloud.len() as f64 / GAUSSIANS_PER_ENTRY) as usize).next_multiple_of(64).min(MOST_ENTRIES);
         let values = quiet(cloud, cameras, RIDGES.0);
         if cloud.len() <= wanted {
             return Self { entries: values, labels: (0..cloud.len()).map(|i| i as u16).collect() };
@@ -188,7 +188,7 @@ mod tests {
         }
         let palette = Palette::new(&map, &cameras);
         let entries = palette.entries.len() / 9;
-        assert!((3..=512).contains(&entries), "{entries}");
+        assert!((3..=832).contains(&entries), "{entries}");
         for i in 0..map.len() {
             let entry = &palette.entries[9 * usize::from(palette.labels[i])..][..9];
             let seen = Seen::new(map.means[i], &cameras);

@@ -61,7 +61,7 @@ fn lies_are_refused() {
     assert!(lie("/means/maxs/0", 1e300.into()).contains("is not finite"));
     assert!(lie("/means/files/0", "../../means_l.webp".into()).contains("../../means_l.webp"));
     assert!(lie("/shN/count", 3.into()).contains("beyond the palette's 3 entries"));
-    assert!(lie("/shN/count", (1 << 40).into()).contains("larger than its labels reach"));
+    assert!(lie("/shN/count", (1u64 << 40).into()).contains("larger than its labels reach"));
     assert!(lie("/shN/bands", 2.into()).contains("shN_centroids.webp"));
     assert!(lie("/shN/bands", 4.into()).contains("degree 4"));
     assert!(lie("/shN/files", vec!["a", "b", "c"].into()).contains("meta.json"));
