@@ -111,7 +111,8 @@ struct Writer<'a> {
     has_depth: bool,
 }
 
-/// An image and whether it was written; none where the frame cannot be read.
+type Loaded = Result<Frame, SequenceError>;
+/// An image that was written; none where the frame cannot be read.
 type Written = Result<Option<PosedImage>, WriteError>;
 
 impl Writer<'_> {
@@ -123,16 +124,13 @@ impl Writer<'_> {
         for batch in poses.chunks(BATCH) {
             let frames = sequence.load_all(&batch.iter().map(|(index, _)| *index).collect::<Vec<usize>>());
             let rectifiers: Vec<_> = batch.iter().map(|(index, _)| rectifiers.of(sequence.camera_of(*index))).collect();
-            let write =
-                |((&(index, pose), frame), rectifier): ((&(usize, Se3), Result<Frame, SequenceError>), Arc<Rectifier>)| {
-                    match frame {
-                        Ok(frame) => self.image(&frame, pose, &rectifier).map(Some),
-                        Err(error) => {
-                            tracing::warn!("frame {index} is left out: {error}");
-                            Ok(None)
-                        }
-                    }
-                };
+            let write = |((posed, frame), rectifier): ((&(usize, Se3), Loaded), Arc<Rectifier>)| match frame {
+                Ok(frame) => self.image(&frame, posed.1, &rectifier).map(Some),
+                Err(error) => {
+                    tracing::warn!("frame {} is left out: {error}", posed.0);
+                    Ok(None)
+                }
+            };
             let written: Vec<Written> = batch.par_iter().zip(frames).zip(rectifiers).map(write).collect();
             for image in written {
                 match image? {

@@ -116,7 +116,7 @@ fn smoothing_by_sampling_intervals_agrees() {
         let still = AdamConfig { max_elongation: 1e6, ..AdamConfig::default().scaled(0.0, 0.0) };
         for mut trainer in both_forms(&gpu) {
             let on_gpu = upload(&gpu, &cloud);
-            let mut learn = |trainer: &mut Trainer, camera: &ViewCamera| {
+            let learn = |trainer: &mut Trainer, camera: &ViewCamera| {
                 let views = [TrainingView::new(*camera, &image)];
                 trainer.steps(&on_gpu, &views, &LossConfig::default(), &still).unwrap();
                 on_gpu.sampling_intervals(&gpu).unwrap()
