@@ -9,7 +9,7 @@ use crate::config::Config;
 use crate::evaluation::metrics::DepthBiasFigures;
 use crate::geometry::{Pinhole, Se3, StampedPose, Trajectory};
 use crate::gpu::Gpu;
-use crate::mesh::{DepthSource, DepthView, Mesh, MeshConfig, fuse};
+use crate::mesh::{DepthSource, DepthView, Mesh, MeshConfig, MeshError, fuse};
 use crate::recording::Recording;
 use crate::render::{GpuCloud, Rasterizer, Rendered};
 use crate::run_folder::OutputError;
@@ -19,6 +19,8 @@ use crate::splat::ViewCamera;
 
 /// The map's depth is taken where it covers so much of a pixel.
 const LEAST_ALPHA: f32 = 0.5;
+/// Fewer pixels show no surface.
+const LEAST_SCALE: f64 = 0.05;
 /// Without the recording, views have this size and this horizontal field of view, degrees.
 const UNKNOWN: (u32, u32, f64) = (640, 480, 60.0);
 
@@ -63,6 +65,9 @@ pub fn mesh_folder(
     on_stage: &dyn Fn(&'static str),
 ) -> Result<FusedMesh, SessionError> {
     options.mesh.validate()?;
+    if let Some(value) = options.scale.filter(|scale| !(LEAST_SCALE..=1.0).contains(scale)) {
+        return Err(MeshError::Option { option: "scale", value, advice: "give a share from 0.05 to 1" }.into());
+    }
     let missing = |name: &str, advice| SessionError::Missing { path: folder.join(name), advice };
     let (map, format) =
         outputs::find_map(folder).ok_or_else(|| missing("map.ply", "give the folder of a run, with a map and its poses"))?;

@@ -66,6 +66,7 @@ fn refusals(out: &Path) {
     };
     refused("x.stl", &[], &["x.stl", ".ply, .glb or .obj"]);
     refused("x.ply", &["--tolerance", "0"], &["--tolerance is 0", "0.0001 to 1"]);
+    refused("x.ply", &["--scale", "0"], &["--scale is 0", "0.05 to 1"]);
     refused("x.ply", &["--max-memory", "2M"], &["--max-memory", "--voxel", "fits"]);
     refused("x.ply", &["--max-memory", "1M", "--all-frames"], &["--every"]);
     refused("x.ply", &["--adapter", "nobody's"], &["nobody's"]);
