@@ -13,7 +13,7 @@ use crate::geometry::Se3;
 use crate::splat::{GaussianCloud, opacity_from_raw};
 
 /// Gaussians that share an entry, on average: an entry costs about as many bytes as so many labels.
-const GAUSSIANS_PER_ENTRY: f64 = 5.5;
+const GAUSSIANS_PER_ENTRY: f64 = 5.0;
 /// Labels have 16 bits.
 pub(super) const MOST_ENTRIES: usize = 1 << 16;
 /// Weight of harmonics themselves beside the colours in a view: they are smaller then where nobody looks. Much to find like ones, and
@@ -61,7 +61,25 @@ impl Palette {
             group.iter().zip(labels).for_each(|(i, label)| palette.labels[*i] = (first + label) as u16);
             palette.entries.extend(entries);
         }
-        palette
+        palette.by_use(dimensions)
+    }
+
+    /// The most used entries first: the high bytes of labels are few then.
+    fn by_use(self, dimensions: usize) -> Self {
+        let mut uses = vec![0usize; self.entries.len() / dimensions];
+        self.labels.iter().for_each(|label| uses[usize::from(*label)] += 1);
+        let mut order: Vec<usize> = (0..uses.len()).collect();
+        order.sort_by_key(|entry| std::cmp::Reverse(uses[*entry]));
+        let mut places = vec![0; uses.len()];
+        order.iter().enumerate().for_each(|(place, entry)| places[*entry] = place as u16);
+        Self {
+            entries: order
+                .iter()
+                .flat_map(|entry| &self.entries[entry * dimensions..(entry + 1) * dimensions])
+                .copied()
+                .collect(),
+            labels: self.labels.iter().map(|label| places[usize::from(*label)]).collect(),
+        }
     }
 }
 
