@@ -13,7 +13,7 @@ use crate::geometry::Se3;
 use crate::splat::{GaussianCloud, opacity_from_raw};
 
 /// Gaussians that share an entry, on average: an entry costs about as many bytes as so many labels.
-const GAUSSIANS_PER_ENTRY: f64 = 5.0;
+const GAUSSIANS_PER_ENTRY: f64 = 5.5;
 /// Labels have 16 bits.
 pub(super) const MOST_ENTRIES: usize = 1 << 16;
 /// Weight of harmonics themselves beside the colours in a view: they are smaller then where nobody looks. Much to find like ones, and
@@ -217,7 +217,7 @@ mod tests {
                 found[0] = seen.constant(&wanted, &found);
                 worst = worst.max(quadratic(&visible(&seen, 4), &(found - wanted), 4));
             }
-            assert!(worst < 1e-4, "{i}: {worst}");
+            assert!(worst < 2e-4, "{i}: {worst}");
         }
         let again = Palette::new(&map, &cameras);
         assert!(again.entries == palette.entries && again.labels == palette.labels);

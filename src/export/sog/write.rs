@@ -18,7 +18,7 @@ const SCALE_STEP: f32 = 1.0 / 12.0;
 const CONSTANT_STEP: f32 = 0.025;
 const HARMONIC_STEP: f32 = 1.0 / 16.0;
 /// Positions are rounded to this share of the median of the Gaussians' least extents, or finer.
-const STEP: f64 = 1.0 / 6.0;
+const STEP: f64 = 1.0 / 8.0;
 /// Sides of WebP images are at most this.
 const MOST_GAUSSIANS: usize = 16_383 * 16_383;
 
