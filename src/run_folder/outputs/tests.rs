@@ -41,7 +41,10 @@ fn the_map_is_found_by_its_format() {
     for &format in MapFormat::all() {
         let path = folder.path().join(format!("map.{}", format.extension()));
         std::fs::write(&path, b"").unwrap();
-        assert_eq!(find_map(folder.path()), Some((path.clone(), format)));
+        // Formats of one extension are read alike.
+        let first = MapFormat::of_path(&path).unwrap();
+        assert_eq!(first.extension(), format.extension());
+        assert_eq!(find_map(folder.path()), Some((path.clone(), first)));
         std::fs::remove_file(path).unwrap();
     }
 }
