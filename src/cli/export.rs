@@ -78,7 +78,12 @@ impl ExportArgs {
 fn find(path: &Path) -> miette::Result<(PathBuf, MapFormat)> {
     let found =
         if path.is_dir() { outputs::find_map(path) } else { MapFormat::of_path(path).map(|format| (path.to_owned(), format)) };
-    let known = || MapFormat::all().iter().map(|format| format!(".{}", format.extension())).collect::<Vec<_>>().join(", ");
+    let known = || {
+        let mut endings: Vec<String> = MapFormat::all().iter().map(|format| format!(".{}", format.extension())).collect();
+        endings.sort();
+        endings.dedup();
+        endings.join(", ")
+    };
     found.ok_or_else(|| miette!("{} is no map; give the folder of a run, or a file of {}", path.display(), known()))
 }
 
