@@ -51,42 +51,40 @@ fn backward(i: u32) {
     let g_0 = symmetric(by_inverse, p_0);
     let g_1 = symmetric(by_inverse, p_1);
     let g_2 = symmetric(by_inverse, p_2);
-    // The compensation's logarithm is that of the determinants without and with the dilation, halved: by t, Σ₀⁻¹t - Σ⁻¹t.
+    // The compensation's logarithm is that of the determinants without and with the dilation, halved. By t it is Σ₀⁻¹t - Σ⁻¹t: a part of p = Σ⁻¹t
+    // less one of t itself.
     let is_compensated = projection.sharp_determinant > LEAST_UNDILUTED * projection.determinant;
-    let by_compensation = select(0.0, view.antialiased * first.x, is_compensated);
-    let s_0 = by_compensation * (inverse_sharp_covariance(projection, projection.image_axis_0) - p_0);
-    let s_1 = by_compensation * (inverse_sharp_covariance(projection, projection.image_axis_1) - p_1);
-    let s_2 = by_compensation * (inverse_sharp_covariance(projection, projection.image_axis_2) - p_2);
-    let by_image_0 = s_0 - 2.0 * inverse_covariance(projection, g_0);
-    let by_image_1 = s_1 - 2.0 * inverse_covariance(projection, g_1);
-    let by_image_2 = s_2 - 2.0 * inverse_covariance(projection, g_2);
-
-    // T = J·M: gradients by J's rows, and by M's columns.
-    let axes = projection.axes_in_camera;
-    let by_jacobian_x = axes * vec3(by_image_0.x, by_image_1.x, by_image_2.x);
-    let by_jacobian_y = axes * vec3(by_image_0.y, by_image_1.y, by_image_2.y);
-    let by_axis_0 = projection.jacobian_x * by_image_0.x + projection.jacobian_y * by_image_0.y;
-    let by_axis_1 = projection.jacobian_x * by_image_1.x + projection.jacobian_y * by_image_1.y;
-    let by_axis_2 = projection.jacobian_x * by_image_2.x + projection.jacobian_y * by_image_2.y;
-
+    let by_compensation = select(0.0, view.antialiased * first.x / projection.sharp_determinant, is_compensated);
+    let part = by_compensation * vec2(projection.determinant - projection.sharp_determinant, projection.dilation);
+    let by_smoothed = vec3(
+        dot(p_0, part.x * projection.image_axis_0 - 2.0 * g_0) - part.y * dot(projection.image_axis_0, projection.image_axis_0),
+        dot(p_1, part.x * projection.image_axis_1 - 2.0 * g_1) - part.y * dot(projection.image_axis_1, projection.image_axis_1),
+        dot(p_2, part.x * projection.image_axis_2 - 2.0 * g_2) - part.y * dot(projection.image_axis_2, projection.image_axis_2),
+    );
+    let by_image_0 = inverse_covariance(projection, part.x * projection.image_axis_0 - 2.0 * g_0) - part.y * projection.image_axis_0;
+    let by_image_1 = inverse_covariance(projection, part.x * projection.image_axis_1 - 2.0 * g_1) - part.y * projection.image_axis_1;
+    let by_image_2 = inverse_covariance(projection, part.x * projection.image_axis_2 - 2.0 * g_2) - part.y * projection.image_axis_2;
     // The least distance between two samples of the surface, where the map is antialiased.
     begin_gradient(i, view.antialiased * projection.p_in_camera.z / max(view.intrinsics.x, view.intrinsics.y));
+    store_gradient(1u, i, vec4(projection.kept * by_smoothed + (1.0 - projection.kept) * first.x, 0.0));
+
+    // T = J·M: gradients by M's columns, and by J's rows.
+    let scale = projection.scale;
+    let by_rotation_matrix = mat3x3(
+        rotate_to_world(view, projection.jacobian_x * by_image_0.x + projection.jacobian_y * by_image_0.y) * scale.x,
+        rotate_to_world(view, projection.jacobian_x * by_image_1.x + projection.jacobian_y * by_image_1.y) * scale.y,
+        rotate_to_world(view, projection.jacobian_x * by_image_2.x + projection.jacobian_y * by_image_2.y) * scale.z,
+    );
+    let by_unit = quaternion_gradient(unit_rotation, by_rotation_matrix);
+    store_gradient(2u, i, (by_unit - unit_rotation * dot(unit_rotation, by_unit)) * inverse_norm);
+
+    let by_jacobian_x = projection.axes_in_camera * vec3(by_image_0.x, by_image_1.x, by_image_2.x);
+    let by_jacobian_y = projection.axes_in_camera * vec3(by_image_0.y, by_image_1.y, by_image_2.y);
     let by_point = point_gradient(projection, by_mean_2d, color_depth.w, by_jacobian_x, by_jacobian_y);
     let by_mean_of_color = color_gradient(i, mean_opacity.xyz, color_depth.xyz);
     let opacity = sigmoid(mean_opacity.w);
     let by_mean = rotate_to_world(view, by_point) + by_mean_of_color;
     store_gradient(0u, i, vec4(by_mean, (1.0 - opacity) * first.x));
-    let by_smoothed = vec3(dot(projection.image_axis_0, s_0), dot(projection.image_axis_1, s_1), dot(projection.image_axis_2, s_2))
-        - 2.0 * vec3(dot(p_0, g_0), dot(p_1, g_1), dot(p_2, g_2));
-    store_gradient(1u, i, vec4(projection.kept * by_smoothed + (1.0 - projection.kept) * first.x, 0.0));
-    let scale = projection.scale;
-    let by_rotation_matrix = mat3x3(
-        rotate_to_world(view, by_axis_0) * scale.x,
-        rotate_to_world(view, by_axis_1) * scale.y,
-        rotate_to_world(view, by_axis_2) * scale.z,
-    );
-    let by_unit = quaternion_gradient(unit_rotation, by_rotation_matrix);
-    store_gradient(2u, i, (by_unit - unit_rotation * dot(unit_rotation, by_unit)) * inverse_norm);
 }
 
 // Product of a symmetric matrix held as (xx, xy, yy).

@@ -290,6 +290,12 @@ impl Config {
         if self.initial_map.is_some() && !self.replay.known_poses {
             return value("an initial map needs the world of known poses: use --known-poses (replay.known_poses), too".into());
         }
+        if self.mapping.antialiased && !self.map_format.keeps_antialiasing() {
+            let name = self.map_format.name();
+            return value(format!(
+                "files of {name} do not say that a map is antialiased; use another --format, or mapping.antialiased = false"
+            ));
+        }
         if self.checkpoint_every == Some(0) {
             return value("checkpoint_every must be at least 1".into());
         }

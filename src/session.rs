@@ -112,6 +112,12 @@ pub enum SessionError {
         /// The folder.
         folder: PathBuf,
     },
+    /// A run that would replace the map that it begins with.
+    #[error("the initial map {map} lies in the folder of the results, where it would be replaced; choose another --out")]
+    InitialMapInOut {
+        /// The file or folder.
+        map: PathBuf,
+    },
     /// A trajectory that belongs to another recording.
     #[error("no pose of {trajectory} is within {seconds} s of a frame of {recording}; name the right recording with --sequence")]
     NoPoseNearFrames {
@@ -183,6 +189,13 @@ impl Session {
     /// If the recording cannot begin a map, or the folder cannot be written to or is in use.
     pub fn with_device(recording: Recording, gpu: Arc<Gpu>, out: &Path) -> Result<Self, SessionError> {
         check_first_frame(&recording)?;
+        if let Some(map) = &recording.config().initial_map {
+            let place = |path: &Path| std::fs::canonicalize(path).ok();
+            let folder = if map.is_dir() { Some(map.as_path()) } else { map.parent() };
+            if place(out).is_some_and(|out| folder.and_then(place) == Some(out)) {
+                return Err(SessionError::InitialMapInOut { map: map.clone() });
+            }
+        }
         let lock = outputs::prepare_folder(out)?;
         Ok(Self { recording: Arc::new(recording), gpu, out: out.into(), checkpoint: None, _lock: lock })
     }

@@ -97,12 +97,6 @@ fn inverse_covariance(p: Projection, v: vec2<f32>) -> vec2<f32> {
     return (p.dilation * v + sum) / p.determinant;
 }
 
-// The same without the dilation, where that leaves more than the least opacity.
-fn inverse_sharp_covariance(p: Projection, v: vec2<f32>) -> vec2<f32> {
-    let sum = across(p.image_axis_0, v) + across(p.image_axis_1, v) + across(p.image_axis_2, v);
-    return sum / max(p.sharp_determinant, LEAST_UNDILUTED * p.dilation * p.dilation);
-}
-
 // The part of v across the axis t, times |t|².
 fn across(t: vec2<f32>, v: vec2<f32>) -> vec2<f32> {
     let perpendicular = vec2(t.y, -t.x);

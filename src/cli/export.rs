@@ -120,7 +120,7 @@ fn export_map(args: &ExportArgs, to: MapFormat) -> miette::Result<String> {
     }
     if part.antialiased && !to.keeps_antialiasing() {
         tracing::warn!(
-            "{} has no place for antialiasing: viewers will draw small Gaussians too opaque; .ply and .spz keep it",
+            "{} has no place for antialiasing: viewers will draw small Gaussians too opaque; .ply, .spz and .sog keep it",
             to.name()
         );
     }

@@ -55,7 +55,7 @@ pub struct RunArgs {
     known_poses: bool,
     /// Begin with this map (.ply, .spz, .sog, .glb, .splat, or the folder of a run) instead of points. It lies in the world of the known
     /// poses.
-    #[arg(long, value_name = "MAP", requires = "known_poses")]
+    #[arg(long, value_name = "MAP")]
     initial_map: Option<PathBuf>,
     /// Part of the name of the adapter to use (see `keysplat adapters`).
     #[arg(long)]
@@ -161,7 +161,7 @@ impl RunArgs {
         }
         config.map_scale = self.map_scale.or(scale).unwrap_or(config.map_scale);
         config.map_format = self.format.unwrap_or(config.map_format);
-        if let Some(path) = &self.initial_map {
+        if let Some(path) = self.initial_map.as_ref().or(config.initial_map.as_ref()) {
             config.initial_map = Some(std::path::absolute(path).into_diagnostic()?);
         }
         config.replay.every = self.every.unwrap_or(config.replay.every);

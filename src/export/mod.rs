@@ -1,6 +1,6 @@
 //! Map formats, one file of code each.
 //!
-//! Adding a format takes one file and one row in `FORMATS`. Trajectories are written by [`crate::geometry::Trajectory`].
+//! Adding a format takes one file and one row in `FORMATS`, before those that are only read. Trajectories are written by [`crate::geometry::Trajectory`].
 
 mod axes;
 pub mod dataset;
@@ -35,7 +35,7 @@ static FORMATS: [MapFormat; 6] = [
     MapFormat(&spz4::FORMAT),
     MapFormat(&splat::FORMAT),
 ];
-/// Of [`FORMATS`].
+/// Number of formats that are written: the first ones of [`FORMATS`].
 const WRITTEN: usize = 5;
 
 /// Encodes a map for cameras at these poses, world from camera, which may be none.

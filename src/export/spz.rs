@@ -45,10 +45,10 @@ const COLOR_SCALE: f32 = 0.15;
 const MOST_HARMONIC: f32 = 127.0 / 128.0;
 /// Bytes are `(log scale + 10) · 16`.
 const LOG_SCALE: (f32, f32) = (10.0, 16.0);
-/// Readers refuse more.
+/// Most Gaussians that readers of SPZ accept.
 pub(super) const MOST_GAUSSIANS: u64 = 10_000_000;
 /// A compressed byte stands for no more than this.
-pub(super) const MOST_INFLATION: u64 = 1032;
+const MOST_INFLATION: u64 = 1032;
 /// Opacities of the bytes 0 and 255, whose logits would not be finite.
 const OPACITIES: (f32, f32) = (1.0 / 1024.0, 1.0 - 1.0 / 1024.0);
 
@@ -62,7 +62,7 @@ fn stride(version: u32, degree: ShDegree) -> usize {
 pub(super) struct Packed {
     pub count: u32,
     pub degree: ShDegree,
-    /// Of a position's 24, behind the point.
+    /// Bits of a position behind the point, of 24.
     pub bits: i32,
     /// [`ANTIALIASED`] or none.
     pub flags: u8,
@@ -184,7 +184,10 @@ pub(super) fn decode(reader: &mut dyn BufRead, size: FileSize, path: &Path) -> R
     }
     let expected = count * stride(version, degree) as u64;
     let cut = || damaged(format!("{count} Gaussians are promised, but the file is cut off or longer"));
-    if count > MOST_GAUSSIANS || expected > file_bytes.saturating_mul(MOST_INFLATION) {
+    if count > MOST_GAUSSIANS {
+        return Err(damaged(format!("{count} Gaussians are promised; at most {MOST_GAUSSIANS} are read")));
+    }
+    if expected > file_bytes.saturating_mul(MOST_INFLATION) {
         return Err(cut());
     }
     let mut bytes = Vec::new();

@@ -5,7 +5,7 @@
 use std::io::{BufRead, Read};
 use std::path::Path;
 
-use super::spz::{self, ANTIALIASED, MAGIC, MOST_GAUSSIANS, MOST_INFLATION, POSITION_BITS, Packed};
+use super::spz::{self, ANTIALIASED, MAGIC, MOST_GAUSSIANS, POSITION_BITS, Packed};
 use super::{ExportError, FileSize, FormatRow};
 use crate::geometry::Se3;
 use crate::splat::{GaussianCloud, ShDegree};
@@ -22,8 +22,10 @@ const VERSION: u32 = 4;
 const HEADER: usize = 32;
 /// An attribute in the table: its length in the file, and unpacked.
 const ROW: usize = 16;
-/// That of Niantic's code.
+/// Compression level of Niantic's code.
 const LEVEL: i32 = 12;
+/// A zstd block of four bytes stands for 128 KiB at most.
+const MOST_INFLATION: u64 = 1 << 15;
 /// Frames may ask for so much memory, as a power of two: twice what that level does.
 const WINDOW_LOG: u32 = 24;
 
@@ -63,7 +65,10 @@ fn unpacked(bytes: &[u8]) -> Result<GaussianCloud, String> {
     }
     let lengths: Vec<u64> = Packed::lengths(count, degree).into_iter().filter(|length| *length > 0).collect();
     let all = lengths.iter().sum::<u64>();
-    if count > MOST_GAUSSIANS || all > (bytes.len() as u64).saturating_mul(MOST_INFLATION) || table < HEADER {
+    if count > MOST_GAUSSIANS {
+        return Err(format!("{count} Gaussians are promised; at most {MOST_GAUSSIANS} are read"));
+    }
+    if all > (bytes.len() as u64).saturating_mul(MOST_INFLATION) || table < HEADER {
         return Err(format!("{count} Gaussians are promised, but the file is cut off or longer"));
     }
     if streams != lengths.len() {
@@ -71,7 +76,7 @@ fn unpacked(bytes: &[u8]) -> Result<GaussianCloud, String> {
     }
     let rows = bytes.get(table..).and_then(|rest| rest.get(..streams * ROW)).ok_or_else(cut)?;
     let mut frames = &bytes[table + streams * ROW..];
-    let mut attributes = Vec::with_capacity(all as usize);
+    let mut attributes = Vec::new();
     for (row, length) in rows.chunks(ROW).zip(lengths) {
         let number = |at: usize| u64::from_le_bytes(row[at..at + 8].try_into().expect("eight bytes"));
         let frame = usize::try_from(number(0)).ok().and_then(|own| frames.split_at_checked(own));
@@ -118,7 +123,11 @@ mod tests {
             lie[at..at + value.len()].copy_from_slice(value);
             read(&lie).unwrap_err().to_string()
         };
-        assert!(refusal(8, &u32::MAX.to_le_bytes()).contains("4294967295 Gaussians are promised"));
+        assert!(refusal(8, &u32::MAX.to_le_bytes()).contains("4294967295 Gaussians are promised; at most"));
+        assert!(refusal(8, &9_999_999u32.to_le_bytes()).contains("9999999 Gaussians are promised, but"));
+        let mut equal = GaussianCloud::new(ShDegree::ALL[3]);
+        (0..10_000).for_each(|_| equal.push(cloud(ShDegree::ALL[3], 1).get(0)));
+        assert_eq!(read(&encode(&equal, &[]).unwrap()).unwrap().len(), 10_000);
         assert!(refusal(8, &[51]).contains("another length"));
         assert!(refusal(15, &[5]).contains("5 attributes, not 6"));
         assert!(refusal(12, &[4]).contains("degree 4"));

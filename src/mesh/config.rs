@@ -16,6 +16,9 @@ pub enum DepthSource {
     Both,
 }
 
+/// Largest side of a voxel, metres.
+pub(super) const MOST_VOXEL_METRES: f64 = 10.0;
+
 /// Settings of a mesh.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -32,7 +35,7 @@ pub struct MeshConfig {
     pub min_views: u16,
     /// A connected component is kept if its area is at least this share of the largest one's; 1 keeps the largest alone, 0 keeps all.
     pub min_component_share: f64,
-    /// Share of the triangles that simplification leaves, at most.
+    /// Share of the triangles that simplification aims at.
     pub simplify: Option<f64>,
     /// Bound on the memory of views and voxels, bytes.
     pub max_memory_bytes: u64,
@@ -68,7 +71,7 @@ impl MeshConfig {
             true => Ok(()),
             false => Err(MeshError::Option { option, value, advice }),
         };
-        within("voxel", self.voxel_metres, (1e-4, 10.0), "give a side from 0.0001 to 10 metres")?;
+        within("voxel", self.voxel_metres, (1e-4, MOST_VOXEL_METRES), "give a side from 0.0001 to 10 metres")?;
         within("truncation", self.truncation_voxels, (2.0, 32.0), "give 2 to 32 voxels")?;
         within("tolerance", self.tolerance, (1e-4, 1.0), "give a share from 0.0001 to 1")?;
         within("min-component", self.min_component_share, (0.0, 1.0), "give a share from 0 to 1")?;

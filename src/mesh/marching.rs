@@ -28,7 +28,7 @@ struct Around<'a> {
 impl<'a> Around<'a> {
     fn new(volume: &'a Volume, key: [i32; 3], min_views: u16) -> Self {
         let block = |bits: usize| {
-            let key = [0, 1, 2].map(|axis| key[axis] + (bits >> axis & 1) as i32);
+            let key = [0, 1, 2].map(|axis| key[axis].saturating_add((bits >> axis & 1) as i32));
             volume.place(&key).map(|place| (place, &volume.blocks[place]))
         };
         Self { blocks: std::array::from_fn(block), min_views: min_views.max(1) }

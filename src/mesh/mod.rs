@@ -78,7 +78,7 @@ impl Mesh {
 pub enum MeshError {
     /// There is nothing to fuse.
     #[error(
-        "no view has depth that the others confirm, so there is no surface; raise --tolerance, or map the recording with more keyframes"
+        "no surface is left: too few views see the same place; lower --min-views, raise --tolerance, take --all-frames, or map the recording with more keyframes"
     )]
     Empty,
     /// A setting is out of its range.
@@ -93,7 +93,7 @@ pub enum MeshError {
     },
     /// The blocks do not fit.
     #[error(
-        "with voxels of {voxel} m the surface needs {needed_mib} MiB, but --max-memory leaves {available_mib} MiB; --voxel {fits} fits"
+        "with voxels of {voxel} m the surface needs at least {needed_mib} MiB, but --max-memory leaves {available_mib} MiB; --voxel {fits} fits"
     )]
     TooLarge {
         /// Asked for, metres.
@@ -116,7 +116,7 @@ pub enum MeshError {
         needed_mib: u64,
     },
     /// A surface that cannot be compared.
-    #[error("one of the surfaces has no area, so there is nothing to compare")]
+    #[error("one of the two surfaces has no area, so there is nothing to compare; give meshes with triangles")]
     NoArea,
     /// An ending that is no format.
     #[error("{path} ends in no known format of meshes; choose .ply, .glb or .obj")]
@@ -171,6 +171,8 @@ pub fn fuse(mut views: Vec<DepthView>, config: &MeshConfig, on_stage: &dyn Fn(&'
     let mut volume = Volume::new(config.voxel_metres, &keys);
     let prepared: Vec<integrate::Projection<'_>> = views.iter().map(|view| integrate::Projection::new(view, config)).collect();
     volume.blocks.par_iter_mut().for_each(|block| prepared.iter().for_each(|view| view.integrate(block)));
+    drop(prepared);
+    drop(views);
     on_stage("extracting the surface");
     let mesh = marching::extract(&volume, config.min_views);
     drop(volume);

@@ -7,6 +7,8 @@ use glam::Vec3;
 
 use super::Mesh;
 
+/// Farther from the origin, squares of lengths overflow, metres.
+const MOST_COORDINATE: f32 = 1e7;
 /// No honest header is longer.
 const MOST_HEADER: usize = 1 << 16;
 /// The colour of vertices that have none.
@@ -112,6 +114,8 @@ struct Element {
 struct Header {
     vertex: Option<Element>,
     face: Option<Element>,
+    /// Whether another element follows the faces.
+    is_past_faces: bool,
     bytes: usize,
 }
 
@@ -148,7 +152,8 @@ impl Header {
             ["element", "vertex", count] if self.vertex.is_none() && self.face.is_none() => self.vertex = Some(element(count)?),
             ["element", "face", count] if self.vertex.is_some() && self.face.is_none() => self.face = Some(element(count)?),
             // What follows the faces is not read.
-            ["element", ..] if self.face.is_some() => {}
+            ["element", ..] if self.face.is_some() => self.is_past_faces = true,
+            ["property", ..] if self.is_past_faces => {}
             ["property", ..] if self.vertex.is_none() => return Err("a property without an element".into()),
             ["property", "list", length, kind, name] if self.face.is_some() => {
                 self.add(name, Scalar::parse(kind)?, Some(Scalar::parse(length)?));
@@ -188,8 +193,8 @@ fn read_vertices(vertex: &Element, bytes: &[u8], mesh: &mut Mesh) -> Result<(), 
     for (index, vertex) in bytes.chunks_exact(vertex.stride).enumerate() {
         let [x, y, z] = [x, y, z].map(|property| property.kind.read(&vertex[property.offset..]) as f32);
         let p = Vec3::new(x, y, z);
-        if !p.is_finite() {
-            return Err(format!("vertex {index} is not finite"));
+        if !(p.is_finite() && p.abs().max_element() <= MOST_COORDINATE) {
+            return Err(format!("vertex {index} is not finite, or farther than 10,000 km from the origin"));
         }
         mesh.vertices.push(p);
         mesh.colors.push(match color {

@@ -14,7 +14,7 @@ const WINDOW: isize = 2;
 const EDGE: f32 = 0.04;
 /// Pixels of the window that must lie on the surface.
 const LEAST_SUPPORT: usize = 9;
-/// Surfaces that are seen at a smaller cosine are left out: an error of a pixel moves them by more than the depth it was seen at.
+/// Surfaces that are seen at a smaller cosine are left out: one pixel's error moves their depth by more than six pixel widths.
 const LEAST_FACING: f32 = 0.15;
 /// Nothing nearer is fused, metres.
 const NEAR_METRES: f32 = 0.05;
@@ -52,7 +52,12 @@ impl DepthView {
 
     /// Memory that it takes.
     pub fn bytes(&self) -> u64 {
-        (self.inverse_depth.len() * (2 * size_of::<f32>() + size_of::<[u8; 3]>())) as u64
+        Self::bytes_of(&self.pinhole)
+    }
+
+    /// Memory of a view of this camera.
+    pub fn bytes_of(pinhole: &Pinhole) -> u64 {
+        u64::from(pinhole.width) * u64::from(pinhole.height) * (2 * size_of::<f32>() + size_of::<[u8; 3]>()) as u64
     }
 
     fn inverse_at(&self, x: isize, y: isize) -> f32 {

@@ -6,13 +6,14 @@ use glam::Vec3;
 use nalgebra::{Point3, Vector2};
 use rayon::prelude::*;
 
+use super::config::MOST_VOXEL_METRES;
 use super::{DepthView, MeshConfig, MeshError};
 
 /// Voxels along a block's side.
 pub(super) const SIDE: usize = 8;
 /// Voxels of a block.
 pub(super) const VOXELS: usize = SIDE * SIDE * SIDE;
-/// Memory of a block: its voxels, its key, and what extraction needs beside them.
+/// Memory of a block: its voxels and its key. The mesh comes on top, when the views are gone.
 const BLOCK_BYTES: u64 = (VOXELS * size_of::<Voxel>() + 256) as u64;
 /// Voxel sizes are tried in steps of this factor until the blocks fit.
 const COARSER: f64 = 1.25;
@@ -79,8 +80,13 @@ pub(super) fn fitting_blocks(views: &[DepthView], config: &MeshConfig, bytes: u6
         Err(counted) => counted,
     };
     let mut fits = config.clone();
-    while blocks(views, &fits, most).is_err() && fits.voxel_metres < f64::MAX {
+    while blocks(views, &fits, most).is_err() {
         fits.voxel_metres *= COARSER;
+        if fits.voxel_metres > MOST_VOXEL_METRES {
+            let of_views: u64 = views.iter().map(DepthView::bytes).sum();
+            let needed_mib = (of_views + counted as u64 * BLOCK_BYTES).div_ceil(1 << 20);
+            return Err(MeshError::TooManyViews { views: views.len(), needed_mib });
+        }
     }
     // Two digits, upwards: a size that somebody may type.
     let digits = 1.0 - fits.voxel_metres.log10().floor();

@@ -64,12 +64,18 @@ pub enum PipelineError {
         points: usize,
     },
     /// The map to begin with cannot be read.
-    #[error("the initial map: {0}")]
+    #[error("the initial map: {0}; a resumed run needs it unchanged at the same place")]
     InitialMap(#[from] ExportError),
     /// There is no map to begin with.
     #[error("the initial map {path} is no map that is read; give a .ply, .spz, .sog, .glb or .splat, or the folder of a run")]
     NoInitialMap {
         /// The file or folder.
+        path: PathBuf,
+    },
+    /// The map to begin with holds nothing.
+    #[error("the initial map {path} holds no Gaussians; give another map, or leave --initial-map out")]
+    EmptyInitialMap {
+        /// The file.
         path: PathBuf,
     },
     /// A resumed run was stopped before it reached its checkpoint.

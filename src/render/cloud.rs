@@ -248,9 +248,13 @@ impl GpuCloud {
 
     /// Reads a buffer of the map's shape: the map itself, or gradients by it.
     pub(crate) fn read_planes(&self, gpu: &Gpu, buffer: &GpuBuffer) -> Result<GaussianCloud, GpuError> {
+        Ok(cloud_from_planes(self.sh_degree, &self.planes_of(gpu, buffer)?))
+    }
+
+    /// The filled part of each plane of a buffer of the map's shape, `[planes][N]`.
+    fn planes_of(&self, gpu: &Gpu, buffer: &GpuBuffer) -> Result<Vec<Vec<[f32; 4]>>, GpuError> {
         let read = gpu.read(None, &self.parts(buffer).collect::<Vec<_>>())?;
-        let planes: Vec<Vec<[f32; 4]>> = (0..self.planes()).map(|plane| read.part(plane)).collect();
-        Ok(cloud_from_planes(self.sh_degree, &planes))
+        Ok((0..self.planes()).map(|plane| read.part(plane)).collect())
     }
 
     /// The least distance of two samples at each Gaussian so far, `[N]` metres; 0 before the first step that moved it.
@@ -267,8 +271,7 @@ impl GpuCloud {
     /// # Errors
     /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn download(&self, gpu: &Gpu) -> Result<GaussianCloud, GpuError> {
-        let read = gpu.read(None, &self.parts(&self.averages).collect::<Vec<_>>())?;
-        let planes: Vec<Vec<[f32; 4]>> = (0..self.planes()).map(|plane| read.part(plane)).collect();
+        let planes = self.planes_of(gpu, &self.averages)?;
         let mut cloud = cloud_from_planes(self.sh_degree, &planes);
         if self.antialiased {
             cloud.antialiased = true;

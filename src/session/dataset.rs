@@ -86,12 +86,18 @@ pub fn export_dataset(
     let evaluate = EvaluateOptions { sequence: options.sequence.clone(), map_scale: Some(1.0), adapter: None };
     let recording = Recording::open(resolve(run, &evaluate)?)?;
     let trajectory = read_trajectory(&poses_file)?;
-    let poses = nearest_frames(recording.sequence(), &trajectory);
+    let mut poses = nearest_frames(recording.sequence(), &trajectory);
+    // Of two poses near one frame, the earlier.
+    poses.sort_by_key(|(frame, _)| *frame);
+    poses.dedup_by_key(|(frame, _)| *frame);
     let points = points(run, &options.points)?;
     let writer = Writer { recording: &recording, out, has_depth: options.format.has_depth() };
     let (images, unreadable) = writer.images(&poses, on_image)?;
     if images.is_empty() {
-        return Err(SessionError::Missing { path: out.join(IMAGES), advice: "not one frame of the recording could be read" });
+        return Err(SessionError::Missing {
+            path: out.join(IMAGES),
+            advice: "not one frame of the recording could be read; look at its files with keysplat check, or name the recording with --sequence",
+        });
     }
     options.format.write(out, &images, &points).map_err(OutputError::from)?;
     Ok(DatasetCounts { images: images.len(), points: points.len(), unreadable })
@@ -151,13 +157,9 @@ impl Writer<'_> {
         });
         let name = format!("{:06}.{}", frame.index, ending.as_ref().map_or("png", |(_, ending)| ending));
         let color = self.out.join(IMAGES).join(&name);
-        match ending {
-            Some((path, _)) => {
-                let bytes = std::fs::read(path).map_err(|source| WriteError { path: path.into(), source })?;
-                write_beside(&color, &bytes)?;
-            }
-            None => write_beside(&color, &png(rectified.color.clone()))?,
-        }
+        // A file that has vanished since it was decoded is encoded anew.
+        let recorded = ending.and_then(|(path, _)| std::fs::read(path).ok());
+        write_beside(&color, &recorded.unwrap_or_else(|| png(rectified.color.clone())))?;
         let (width, height) = rectified.color.dimensions();
         if let Some(valid) = &rectified.valid {
             let mask = GrayImage::from_fn(width, height, |x, y| Luma([if valid[(y * width + x) as usize] { 255 } else { 0 }]));

@@ -10,11 +10,11 @@ use crate::evaluation::metrics::DepthBiasFigures;
 use crate::geometry::{Pinhole, Se3, StampedPose, Trajectory};
 use crate::gpu::Gpu;
 use crate::mesh::{DepthSource, DepthView, Mesh, MeshConfig, MeshError, fuse};
-use crate::recording::Recording;
+use crate::recording::{Recording, RecordingError};
 use crate::render::{GpuCloud, Rasterizer, Rendered};
 use crate::run_folder::OutputError;
 use crate::run_folder::outputs;
-use crate::sequence::{RectifiedImage, Rectifiers};
+use crate::sequence::{RectifiedImage, Rectifiers, SequenceError};
 use crate::splat::ViewCamera;
 
 /// The map's depth is taken where it covers so much of a pixel.
@@ -78,14 +78,20 @@ pub fn mesh_folder(
     let poses = read_trajectory(&folder.join(file))?;
     let cloud = format.read(&map).map_err(OutputError::from)?;
     let recording = open_recording(folder, options)?;
-    let sensor = recording.as_ref().map(|recording| Measured::new(recording, folder, options.scale)).transpose()?;
+    let sensor = recording.as_ref().map(|recording| Measured::new(recording, folder, options)).transpose()?;
     let pinhole = sensor.as_ref().map_or_else(unknown_pinhole, |sensor| sensor.pinhole);
     let frames = frame_of_pose(recording.as_ref(), &poses);
     let gpu = Gpu::open(options.adapter.as_deref())?;
-    let mut on_gpu = GpuCloud::new(&gpu, cloud.sh_degree, cloud.len())?;
-    on_gpu.append(&gpu, &cloud)?;
+    let on_gpu = GpuCloud::of(&gpu, &cloud)?;
     let mut rasterizer = Rasterizer::new(gpu)?;
     let stamped: Vec<_> = poses.poses.iter().step_by(options.every.max(1)).collect();
+    if stamped.is_empty() {
+        return Err(missing(file, "it holds no pose; map the recording again"));
+    }
+    let bytes = stamped.len() as u64 * DepthView::bytes_of(&pinhole);
+    if bytes >= options.mesh.max_memory_bytes {
+        return Err(MeshError::TooManyViews { views: stamped.len(), needed_mib: bytes >> 20 }.into());
+    }
     let (mut views, mut measured) = (Vec::new(), 0);
     let mut sensor = sensor.filter(|_| options.depth != Some(DepthSource::Rendered));
     for (done, pose) in stamped.iter().enumerate() {
@@ -107,7 +113,8 @@ pub fn mesh_folder(
 
 /// The recording that a folder or the options name. One that the folder names may have gone: the map's depth needs none.
 fn open_recording(folder: &Path, options: &MeshOptions) -> Result<Option<Recording>, SessionError> {
-    let config = Config::read(&folder.join(outputs::CONFIG)).ok();
+    let file = folder.join(outputs::CONFIG);
+    let config = if file.is_file() { Some(Config::read(&file).map_err(RecordingError::from)?) } else { None };
     if let Some(path) = &options.sequence {
         let mut config = config.unwrap_or_default();
         config.sequence.get_or_insert_default().path.clone_from(path);
@@ -134,17 +141,19 @@ struct Measured<'a> {
 }
 
 impl<'a> Measured<'a> {
-    fn new(recording: &'a Recording, folder: &Path, scale: Option<f64>) -> Result<Self, SessionError> {
-        let scale = scale.unwrap_or(recording.config().map_scale);
+    fn new(recording: &'a Recording, folder: &Path, options: &MeshOptions) -> Result<Self, SessionError> {
+        let has_depth = options.depth != Some(DepthSource::Rendered);
+        let scale = options.scale.unwrap_or(recording.config().map_scale);
         let pinhole = recording.sequence().camera.pinhole.scaled(scale);
-        let bias = earlier_metrics(folder)?.and_then(|metrics| metrics.depth_bias);
+        let bias = if has_depth { earlier_metrics(folder)?.and_then(|metrics| metrics.depth_bias) } else { None };
         Ok(Self { recording, rectifiers: Rectifiers::new(scale), pinhole, bias })
     }
 
     /// A frame's image, unless it cannot be read or has another camera.
     fn image(&mut self, frame: usize) -> Option<RectifiedImage> {
         let sequence = self.recording.sequence();
-        let loaded = sequence.load(frame).ok()?;
+        let unread = |error: &SequenceError| tracing::warn!("frame {frame} is fused without measured depth: {error}");
+        let loaded = sequence.load(frame).inspect_err(unread).ok()?;
         let mut image = self.rectifiers.of(sequence.camera_of(frame)).rectify(&loaded);
         if let (Some(depth), Some(bias)) = (&mut image.depth, self.bias) {
             let half = 0.5 * f64::from(depth.width);

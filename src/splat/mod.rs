@@ -69,7 +69,7 @@ impl GaussianCloud {
             let kept = growth.iter().product::<f64>().sqrt().recip();
             let raw_opacity = f64::from(self.raw_opacities[i]);
             let opacity = kept / (1.0 + (-raw_opacity).exp());
-            self.raw_opacities[i] = (opacity / (1.0 - opacity)).ln().max(f64::from(f32::MIN)) as f32;
+            self.raw_opacities[i] = (opacity / (1.0 - opacity)).ln().clamp(f64::from(f32::MIN), f64::from(f32::MAX)) as f32;
         }
     }
 

@@ -8,7 +8,7 @@ use zip::{CompressionMethod, DateTime, ZipArchive, ZipWriter};
 
 /// Most pixels per byte of the file, beyond [`FEW_PIXELS`]: an honest Gaussian takes ten bytes, and its image a pixel or two.
 const PIXELS_PER_BYTE: u64 = 8;
-const FEW_PIXELS: u64 = 4096;
+const FEW_PIXELS: u64 = 1 << 18;
 /// Most bytes of an entry per byte of the file, beyond [`FEW_BYTES`].
 const INFLATION: u64 = 16;
 const FEW_BYTES: u64 = 1 << 16;

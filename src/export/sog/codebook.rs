@@ -46,9 +46,9 @@ impl Codebook {
 
 /// Means of the stretches of sorted numbers that are nearest to each, from stretches of equal counts.
 fn lloyd(sorted: &[f32]) -> Vec<f32> {
-    let mut sums = vec![0f64];
-    sorted.iter().for_each(|number| sums.push(sums[sums.len() - 1] + f64::from(*number)));
-    let mean = |from: usize, to: usize| ((sums[to] - sums[from]) / (to - from) as f64) as f32;
+    // Of each stretch by itself: differences of running sums would cancel.
+    let sum = |from: usize, to: usize| sorted[from..to].iter().map(|number| f64::from(*number)).sum::<f64>();
+    let mean = |from: usize, to: usize| (sum(from, to) / (to - from) as f64) as f32;
     let mut ends: Vec<usize> = (0..=ENTRIES).map(|k| k * sorted.len() / ENTRIES).collect();
     let mut values = Vec::new();
     for _ in 0..ROUNDS {

@@ -20,8 +20,8 @@ use super::FormatRow;
 pub(super) const FORMAT: FormatRow = FormatRow {
     name: "sog",
     extension: "sog",
-    help: "SOG version 2: less than a tenth of the PLY's size, with a palette of harmonics; PlayCanvas and most web viewers read it.",
-    keeps_antialiasing: false,
+    help: "SOG version 2: about a tenth of the PLY's size, with a palette of harmonics; PlayCanvas and most web viewers read it.",
+    keeps_antialiasing: true,
     is_lossless: false,
     // Positions are as exact as the Gaussians are large.
     tolerance: 0.2,
@@ -37,7 +37,7 @@ const ENTRIES_A_ROW: usize = 64;
 const LARGEST: u8 = 252;
 /// Opacities of the bytes 0 and 255, whose logits would not be finite.
 const OPACITIES: (f32, f32) = (1.0 / 1024.0, 1.0 - 1.0 / 1024.0);
-/// Of a position's 16 bits.
+/// Largest code of a position's 16 bits.
 const MOST_CODE: f64 = 65535.0;
 
 /// `meta.json`.
@@ -49,6 +49,8 @@ struct Meta {
     scales: Coded,
     quats: Files,
     sh0: Coded,
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    antialias: bool,
     #[serde(rename = "shN", default, skip_serializing_if = "Option::is_none")]
     harmonics: Option<Palette>,
 }

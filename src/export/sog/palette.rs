@@ -51,7 +51,8 @@ impl Palette {
         let exact = quiet(cloud, cameras, RIDGES.1);
         let shown = Shown { cloud, cameras, values: &exact };
         let share = |(group, error): (&Vec<usize>, &f64)| {
-            let entries = (error / all * (wanted - wanted.isqrt()) as f64) as usize + 1;
+            let entries = (error / all * (wanted - wanted.isqrt()) as f64) as usize;
+            let entries = entries.min(group.len()) + 1;
             refined(&points, &shown, group, entries)
         };
         let parts: Vec<(Vec<f32>, Vec<usize>)> = members.par_iter().zip(&errors).map(share).collect();

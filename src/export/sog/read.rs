@@ -12,8 +12,9 @@ use super::{Coded, ENTRIES_A_ROW, LARGEST, META, MOST_CODE, Meta, OPACITIES, Pal
 use crate::export::{ExportError, FileSize};
 use crate::splat::{Gaussian, GaussianCloud, ShDegree, raw_opacity_from_opacity};
 
-/// Gaussians per byte of a file, at most: honest ones take ten bytes and more.
+/// Gaussians per byte of a file, at most: honest ones take ten bytes and more, unless few of them are all alike.
 const MOST_PER_BYTE: u64 = 4;
+const FEW: u64 = 1 << 16;
 
 pub(super) fn decode(reader: &mut dyn BufRead, FileSize(size): FileSize, path: &Path) -> Result<GaussianCloud, ExportError> {
     let mut bytes = Vec::new();
@@ -36,7 +37,7 @@ fn unpack(bytes: &[u8]) -> Result<GaussianCloud, String> {
         version => return Err(format!("SOG version {} is not read; convert it to version 2, or to PLY", version.unwrap_or(1))),
     }
     let meta: Meta = serde_json::from_slice(&text).map_err(wrong)?;
-    if meta.count > bytes.len() as u64 * MOST_PER_BYTE {
+    if meta.count > bytes.len() as u64 * MOST_PER_BYTE + FEW {
         return Err(format!("{} Gaussians are promised, more than the file can hold", meta.count));
     }
     let count = meta.count as usize;
@@ -46,7 +47,7 @@ fn unpack(bytes: &[u8]) -> Result<GaussianCloud, String> {
     let colors = Indexed::new(&mut zip, &meta.sh0, count)?;
     let harmonics = meta.harmonics.as_ref().map(|palette| Harmonics::new(&mut zip, palette, count)).transpose()?;
     let degree = harmonics.as_ref().map_or(ShDegree::default(), |harmonics| harmonics.degree);
-    let mut cloud = GaussianCloud::new(degree);
+    let mut cloud = GaussianCloud { antialiased: meta.antialias, ..GaussianCloud::new(degree) };
     for i in 0..count {
         let opacity = (f32::from(colors.plane.pixels[i][3]) / 255.0).clamp(OPACITIES.0, OPACITIES.1);
         let mut sh = vec![colors.of(i)?];

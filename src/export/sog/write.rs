@@ -19,8 +19,10 @@ const CONSTANT_STEP: f32 = 0.025;
 const HARMONIC_STEP: f32 = 1.0 / 16.0;
 /// Positions are rounded to this share of the median of the Gaussians' least extents, or finer.
 const STEP: f64 = 1.0 / 8.0;
-/// Sides of WebP images are at most this.
-const MOST_GAUSSIANS: usize = 16_383 * 16_383;
+/// Sides of WebP images are at most 16,383, and ours multiples of four.
+const MOST_GAUSSIANS: usize = 16_380 * 16_380;
+/// Harmonics beyond are cut off: their squares and sums stay finite.
+const MOST_HARMONIC: f32 = 1e4;
 
 /// The whole file, for cameras at these poses (world from camera), which may be none.
 pub(super) fn encode(cloud: &GaussianCloud, cameras: &[Se3]) -> Result<Vec<u8>, ExportError> {
@@ -36,6 +38,7 @@ pub(super) fn encode(cloud: &GaussianCloud, cameras: &[Se3]) -> Result<Vec<u8>, 
 }
 
 fn bundle(mut cloud: GaussianCloud, cameras: &[Se3]) -> Result<Vec<u8>, String> {
+    cloud.sh.iter_mut().for_each(|c| *c = c.clamp(Vec3::splat(-MOST_HARMONIC), Vec3::splat(MOST_HARMONIC)));
     let mut zip = Writer::new();
     let harmonics = if cloud.sh_degree.get() > 0 { Some(write_harmonics(&mut zip, &mut cloud, cameras)?) } else { None };
     let count = cloud.len();
@@ -58,6 +61,7 @@ fn bundle(mut cloud: GaussianCloud, cameras: &[Se3]) -> Result<Vec<u8>, String> 
         means,
         scales: Coded { codebook: scales.0, files: ["scales.webp".into()] },
         quats: Files { files: ["quats.webp".into()] },
+        antialias: cloud.antialiased,
         sh0: Coded { codebook: colors.0, files: ["sh0.webp".into()] },
         harmonics,
     };

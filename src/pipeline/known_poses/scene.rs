@@ -143,6 +143,16 @@ fn initial_map(path: &Path, recording: &Recording) -> Result<Arc<GaussianCloud>,
         if path.is_dir() { outputs::find_map(path) } else { MapFormat::of_path(path).map(|format| (path.into(), format)) };
     let (path, format) = found.ok_or_else(|| PipelineError::NoInitialMap { path: path.into() })?;
     let map = format.read(&path)?;
+    if map.is_empty() {
+        return Err(PipelineError::EmptyInitialMap { path });
+    }
+    let antialiased = recording.config().mapping.antialiased;
+    if map.antialiased != antialiased {
+        let path = path.display();
+        tracing::warn!(
+            "mapping.antialiased is {antialiased}, unlike in {path}: its opacities are wrong until steps correct them"
+        );
+    }
     let max_gaussians = recording.config().mapping.limits.max_gaussians;
     let map = ExportFilter { max_gaussians, ..ExportFilter::default() }.apply(&map);
     tracing::info!(gaussians = map.len(), "the map begins with that of {}", path.display());
