@@ -395,11 +395,7 @@ fn damaged_files_say_what_is_wrong() {
     assert!(with("element face 8", "element face x").contains("x.ply is no mesh"));
     let more = text.replacen("end_header", "element edge 0\nproperty int vertex1\nend_header", 1).into_bytes();
     assert!(decode(&[more.as_slice(), &whole[end..]].concat()).is_ok(), "what follows the faces is passed over");
-    let mut far = whole.clone();
-    far[end..end + 4].copy_from_slice(&1e20f32.to_le_bytes());
-    assert!(decode(&far).unwrap_err().to_string().contains("vertex 0 is not finite, or farther"));
-    let mut bytes = whole.clone();
-    let last = bytes.len() - 1;
-    bytes[last] = 255;
-    assert!(decode(&bytes).unwrap_err().to_string().contains("face 7 names a vertex"));
+    let changed = |at: usize, to: &[u8]| decode(&[&whole[..at], to, &whole[at + to.len()..]].concat()).unwrap_err().to_string();
+    assert!(changed(end, &1e20f32.to_le_bytes()).contains("vertex 0 is not finite, or farther"));
+    assert!(changed(whole.len() - 1, &[255]).contains("face 7 names a vertex"));
 }
