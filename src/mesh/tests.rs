@@ -384,17 +384,15 @@ fn damaged_files_say_what_is_wrong() {
     }
     let end = whole.windows(11).position(|window| window == b"end_header\n").unwrap() + 11;
     let text = String::from_utf8(whole[..end].to_vec()).unwrap();
-    let with = |from: &str, to: &str| {
-        let header = text.replacen(from, to, 1).into_bytes();
-        decode(&[header.as_slice(), &whole[end..]].concat()).unwrap_err().to_string()
-    };
+    let with =
+        |from: &str, to: &str| decode(&[text.replacen(from, to, 1).as_bytes(), &whole[end..]].concat()).unwrap_err().to_string();
     assert!(with("binary_little_endian", "ascii").contains("`format ascii 1.0` is not supported"));
     assert!(with("element vertex 9", "element vertex 999999999999").contains("cut off"));
     assert!(with("property float x", "property float q").contains("lack x, y or z"));
     assert!(with("vertex_indices", "else").contains("vertex_indices"));
     assert!(with("element face 8", "element face x").contains("x.ply is no mesh"));
-    let more = text.replacen("end_header", "element edge 0\nproperty int vertex1\nend_header", 1).into_bytes();
-    assert!(decode(&[more.as_slice(), &whole[end..]].concat()).is_ok(), "what follows the faces is passed over");
+    let edges = text.replacen("end_header", "element edge 0\nproperty int vertex1\nend_header", 1);
+    assert!(decode(&[edges.as_bytes(), &whole[end..]].concat()).is_ok());
     let changed = |at: usize, to: &[u8]| decode(&[&whole[..at], to, &whole[at + to.len()..]].concat()).unwrap_err().to_string();
     assert!(changed(end, &1e20f32.to_le_bytes()).contains("vertex 0 is not finite, or farther"));
     assert!(changed(whole.len() - 1, &[255]).contains("face 7 names a vertex"));
