@@ -86,7 +86,7 @@ fn photos_are_mapped_from_points_whatever_their_unit() {
     assert!(psnr[0] > 24.0 && (psnr[0] - psnr[1]).abs() < 1.0, "{psnr:?}");
 }
 
-/// Whatever the format: a map given back begins better than points do.
+/// A map given back begins better than points do, and stays where it is.
 #[test]
 fn an_exported_map_given_back_begins_better_than_points() {
     let photos = colmap("given-back", 1.0);
@@ -106,6 +106,14 @@ fn an_exported_map_given_back_begins_better_than_points() {
     few("of-nothing", &["--initial-map", "nothing.ply"]).refused(&["nothing.ply"]);
     let psnr = |out: &Path| metrics(out).images.held_out.unwrap().psnr_db.unwrap();
     let first = run("given", &photos);
+    finish(run_command(&photos, &first, &[&REFINE[..], &["--initial-map", first.to_str().unwrap()]].concat())).refused(&[
+        "given",
+        "would be replaced",
+        "another --out",
+    ]);
+    assert!(first.join("map.ply").is_file());
+    let unsaid = ["--known-poses", "--format", "glb", "--set", "mapping.antialiased=true"];
+    finish(run_command(&photos, &scratch().join("unsaid"), &unsaid)).refused(&["glb", "antialiased"]);
     few("from-points", &[]).succeeded();
     let from_points = psnr(&scratch().join("from-points"));
     for format in ["ply", "spz", "sog"] {
