@@ -9,7 +9,7 @@ use keysplat::export::MapFormat;
 use keysplat::geometry::Trajectory;
 use keysplat::gpu::Gpu;
 use keysplat::render::{GpuCloud, Rasterizer};
-use keysplat::splat::ViewCamera;
+use keysplat::splat::{GaussianCloud, ViewCamera};
 use keysplat::viewing::PackedMap;
 use keysplat::{Config, Recording};
 use serde_json::json;
@@ -200,7 +200,7 @@ fn psnr(a: &[u8], b: &[u8]) -> f64 {
     10.0 * (255.0 * 255.0 * squares.len() as f64 / squares.iter().sum::<f64>().max(1e-9)).log10()
 }
 
-/// The page draws what our rasterizer draws, from a server and from a report's file; by keyboard, on a phone and on a desk.
+/// The page draws what our rasterizer draws, from a server and, of an antialiased map, from a report's file; by keyboard, on a phone and on a desk.
 #[test]
 fn a_browser_draws_the_map_as_we_do() {
     if skipped_without_adapter() {
@@ -209,24 +209,31 @@ fn a_browser_draws_the_map_as_we_do() {
     let Some(program) = chromium() else { return };
     let out = scratch().join("shown");
     finish(run_command(recording(), &out, &[])).succeeded();
-    finish(keysplat(["report".as_ref(), out.as_os_str()])).succeeded();
     let serving = Serving::view(&out);
     let mut page = Page::open(program, &scratch().join("profile"));
     let cloud = MapFormat::default().read(&out.join("map.ply")).unwrap();
+    page.go(&serving.url);
+    page.wait_until("window.keysplat !== undefined");
+    page.wait_until(&format!("window.keysplat.state().gaussians === {}", cloud.len()));
+    // Smaller than a pixel, where opacities shrink.
+    let mut small = GaussianCloud { antialiased: true, ..cloud.clone() };
+    small.log_scales.iter_mut().for_each(|log_scale| *log_scale -= 1.5);
+    MapFormat::default().write(&small, &out.join("map.ply")).unwrap();
+    finish(keysplat(["report".as_ref(), out.as_os_str()])).succeeded();
     let recording = Recording::open(Config::read(&out.join("config.toml")).unwrap()).unwrap();
     let pinhole = recording.map_pinhole();
     let keyframes = Trajectory::read_tum(&out.join("keyframes.txt")).unwrap().poses;
     let gpu = Gpu::open(None).unwrap();
-    let map = GpuCloud::of(&gpu, &cloud).unwrap();
-    let mut rasterizer = Rasterizer::new(gpu).unwrap();
+    let mut rasterizer = Rasterizer::new(gpu.clone()).unwrap();
     let report = format!("file://{}", std::fs::canonicalize(out.join("report.html")).unwrap().display());
-    for (address, width, height, dark) in [(serving.url.as_str(), 1400, 900, false), (&report, 390, 844, true)] {
+    for (address, cloud, width, height, dark) in [(&serving.url, &cloud, 1400, 900, false), (&report, &small, 390, 844, true)] {
+        let map = GpuCloud::of(&gpu, cloud).unwrap();
         page.window(width, height, dark);
         page.go(address);
         page.wait_until("window.keysplat !== undefined");
         page.wait_until(&format!("window.keysplat.state().gaussians === {}", cloud.len()));
         page.evaluate("window.keysplat.settled()");
-        let digest = PackedMap::new(&cloud, 1, None).digest();
+        let digest = PackedMap::new(cloud, 1, None).digest();
         assert_eq!(page.evaluate("window.keysplat.state().digest"), digest);
         assert_eq!(page.evaluate("window.keysplat.state().keyframes"), keyframes.len());
         assert_eq!(page.evaluate("document.documentElement.scrollWidth <= innerWidth"), true, "{width}");
