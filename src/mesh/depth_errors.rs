@@ -7,7 +7,7 @@ use serde::Serialize;
 use super::Mesh;
 use crate::geometry::{Pinhole, Se3};
 
-/// Triangles are cut off nearer than this, metres.
+/// Depth of the plane that cuts triangles off, metres.
 const NEAR_METRES: f64 = 0.01;
 
 /// Depth errors over all views.
@@ -44,12 +44,31 @@ fn depth(mesh: &Mesh, pinhole: &Pinhole, world_from_camera: &Se3) -> Vec<f32> {
     let mut depth = vec![f32::INFINITY; (pinhole.width * pinhole.height) as usize];
     for triangle in &mesh.triangles {
         let corners = triangle.map(|i| in_camera[i as usize]);
-        // Triangles are small: those that reach behind the camera's plane are left out.
-        if corners.iter().all(|p| p.z > NEAR_METRES) {
-            draw(&corners, pinhole, &mut depth);
+        let before = corners.iter().filter(|p| p.z > NEAR_METRES).count();
+        match before {
+            0 => {}
+            3 => draw(&corners, pinhole, &mut depth),
+            _ => {
+                let part = clipped(&corners);
+                part.windows(2).skip(1).for_each(|edge| draw(&[part[0], edge[0], edge[1]], pinhole, &mut depth));
+            }
         }
     }
     depth
+}
+
+/// Corners of the part of a triangle that lies beyond the near plane (Sutherland & Hodgman 1974).
+fn clipped(corners: &[Vector3<f64>; 3]) -> Vec<Vector3<f64>> {
+    let mut part = Vec::with_capacity(4);
+    for (a, b) in (0..3).map(|k| (corners[k], corners[(k + 1) % 3])) {
+        if a.z > NEAR_METRES {
+            part.push(a);
+        }
+        if (a.z > NEAR_METRES) != (b.z > NEAR_METRES) {
+            part.push(a.lerp(&b, (NEAR_METRES - a.z) / (b.z - a.z)));
+        }
+    }
+    part
 }
 
 /// Draws one triangle; inverse depth is linear over the image.
@@ -76,6 +95,31 @@ fn draw(corners: &[Vector3<f64>; 3], pinhole: &Pinhole, depth: &mut [f32]) {
             let z = (a / corners[0].z + b / corners[1].z + c / corners[2].z).recip() as f32;
             let nearest = &mut depth[(y * pinhole.width + x) as usize];
             *nearest = nearest.min(z);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::Vec3;
+
+    use super::*;
+
+    /// Two triangles that begin far behind the camera.
+    #[test]
+    fn a_floor_is_seen_from_where_the_camera_stands() {
+        let pinhole = Pinhole { fx: 40.0, fy: 40.0, cx: 15.5, cy: 11.5, width: 32, height: 24 };
+        let corner = |x: f32, z: f32| Vec3::new(x, 1.0, z);
+        let vertices = vec![corner(-20.0, -20.0), corner(20.0, -20.0), corner(20.0, 20.0), corner(-20.0, 20.0)];
+        let floor = Mesh { colors: vec![[0; 3]; 4], triangles: vec![[0, 1, 2], [0, 2, 3]], vertices };
+        let seen = depth(&floor, &pinhole, &Se3::identity());
+        for (i, z) in seen.iter().enumerate() {
+            let below = f64::from(i as u32 / pinhole.width) - pinhole.cy;
+            let expected = pinhole.fy / below;
+            match below > 0.0 && expected < 20.0 {
+                true => assert!((f64::from(*z) - expected).abs() < 1e-4 * expected, "{i}: {z} is not {expected}"),
+                false => assert!(z.is_infinite(), "{i}: {z}"),
+            }
         }
     }
 }
