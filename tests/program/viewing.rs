@@ -8,7 +8,7 @@ use std::time::Duration;
 use keysplat::export::MapFormat;
 use keysplat::geometry::Trajectory;
 use keysplat::gpu::Gpu;
-use keysplat::render::{GpuCloud, Rasterizer};
+use keysplat::render::{GpuCloud, Rasterizer, Rendered};
 use keysplat::splat::{GaussianCloud, ViewCamera};
 use keysplat::viewing::PackedMap;
 use keysplat::{Config, Recording};
@@ -200,6 +200,21 @@ fn psnr(a: &[u8], b: &[u8]) -> f64 {
     10.0 * (255.0 * 255.0 * squares.len() as f64 / squares.iter().sum::<f64>().max(1e-9)).log10()
 }
 
+/// Lets the page draw a view, and compares it with ours.
+fn compare(page: &mut Page, camera: &ViewCamera, ours: &Rendered) {
+    let (world_from_camera, pinhole) = (camera.camera_from_world.inverse(), camera.pinhole);
+    let (p, q) = (world_from_camera.translation.vector, world_from_camera.rotation.coords);
+    let view = json!({ "p": [p.x, p.y, p.z], "q": [q.x, q.y, q.z, q.w], "camera": {
+        "width": pinhole.width, "height": pinhole.height,
+        "fx": pinhole.fx, "fy": pinhole.fy, "cx": pinhole.cx, "cy": pinhole.cy } });
+    let drawn = page.evaluate(&format!("window.keysplat.draw({view}).then(picture => Array.from(picture.rgba))"));
+    let drawn: Vec<u8> = drawn.as_array().unwrap().iter().map(|v| v.as_u64().unwrap() as u8).collect();
+    let byte = |v: f32| (v.clamp(0.0, 1.0) * 255.0).round() as u8;
+    let ours: Vec<u8> = ours.color_depth.iter().flat_map(|p| [byte(p[0]), byte(p[1]), byte(p[2]), 255]).collect();
+    assert_eq!(ours.len(), drawn.len());
+    assert!(psnr(&drawn, &ours) > 30.0, "{} dB", psnr(&drawn, &ours));
+}
+
 /// The page draws what our rasterizer draws, from a server and, of an antialiased map, from a report's file; by keyboard, on a phone and on a desk.
 #[test]
 fn a_browser_draws_the_map_as_we_do() {
@@ -238,19 +253,9 @@ fn a_browser_draws_the_map_as_we_do() {
         assert_eq!(page.evaluate("window.keysplat.state().keyframes"), keyframes.len());
         assert_eq!(page.evaluate("document.documentElement.scrollWidth <= innerWidth"), true, "{width}");
         for pose in keyframes.iter().step_by(keyframes.len().div_ceil(3)) {
-            let world_from_camera = pose.world_from_camera;
-            let (p, q) = (world_from_camera.translation.vector, world_from_camera.rotation.coords);
-            let view = json!({ "p": [p.x, p.y, p.z], "q": [q.x, q.y, q.z, q.w], "camera": {
-                "width": pinhole.width, "height": pinhole.height,
-                "fx": pinhole.fx, "fy": pinhole.fy, "cx": pinhole.cx, "cy": pinhole.cy } });
-            let drawn = page.evaluate(&format!("window.keysplat.draw({view}).then(picture => Array.from(picture.rgba))"));
-            let drawn: Vec<u8> = drawn.as_array().unwrap().iter().map(|v| v.as_u64().unwrap() as u8).collect();
-            let camera = ViewCamera { pinhole, camera_from_world: world_from_camera.inverse() };
+            let camera = ViewCamera { pinhole, camera_from_world: pose.world_from_camera.inverse() };
             let ours = rasterizer.render(&map, &camera, [0.0; 3]).unwrap();
-            let byte = |v: f32| (v.clamp(0.0, 1.0) * 255.0).round() as u8;
-            let ours: Vec<u8> = ours.color_depth.iter().flat_map(|p| [byte(p[0]), byte(p[1]), byte(p[2]), 255]).collect();
-            assert_eq!(ours.len(), drawn.len());
-            assert!(psnr(&drawn, &ours) > 30.0, "{} dB", psnr(&drawn, &ours));
+            compare(&mut page, &camera, &ours);
         }
         page.screenshot(&scratch().join(format!("page-{width}.png")));
         let steps = |page: &mut Page| page.press("]", "BracketRight", 221);
