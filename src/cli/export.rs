@@ -76,15 +76,14 @@ impl ExportArgs {
 
 /// The map of a run's folder, or of a file.
 fn find(path: &Path) -> miette::Result<(PathBuf, MapFormat)> {
-    let found =
-        if path.is_dir() { outputs::find_map(path) } else { MapFormat::of_path(path).map(|format| (path.to_owned(), format)) };
     let known = || {
         let mut endings: Vec<String> = MapFormat::all().iter().map(|format| format!(".{}", format.extension())).collect();
         endings.sort();
         endings.dedup();
         endings.join(", ")
     };
-    found.ok_or_else(|| miette!("{} is no map; give the folder of a run, or a file of {}", path.display(), known()))
+    outputs::find_map(path)
+        .ok_or_else(|| miette!("{} is no map; give the folder of a run, or a file of {}", path.display(), known()))
 }
 
 /// Poses of a run's keyframes; none where only a map is there.

@@ -40,8 +40,6 @@ pub struct RenderArgs {
     adapter: Option<String>,
 }
 
-/// Without the recording, the picture has this size and this horizontal field of view.
-const UNKNOWN: (u32, u32, f64) = (640, 480, 60.0);
 const MOST_FRAMES: f64 = 100_000.0;
 
 pub fn render(args: &RenderArgs, verbosity: Verbosity) -> miette::Result<()> {
@@ -81,12 +79,7 @@ pub fn render(args: &RenderArgs, verbosity: Verbosity) -> miette::Result<()> {
 fn pinhole(args: &RenderArgs) -> Pinhole {
     let config = Config::read(&args.dir.join(outputs::CONFIG)).ok();
     let recorded = config.and_then(|config| Recording::open(config).ok()).map(|recording| recording.map_pinhole());
-    let recorded = recorded.unwrap_or_else(|| {
-        let (width, height, degrees) = UNKNOWN;
-        let focal = 0.5 * f64::from(width) / (0.5 * degrees.to_radians()).tan();
-        let centre = |side: u32| 0.5 * (f64::from(side) - 1.0);
-        Pinhole { fx: focal, fy: focal, cx: centre(width), cy: centre(height), width, height }
-    });
+    let recorded = recorded.unwrap_or_else(Pinhole::assumed);
     let (width, height) = args.size.unwrap_or((recorded.width, recorded.height));
     let (width, height) = (width & !1, height & !1);
     let scale = (f64::from(width) / f64::from(recorded.width)).min(f64::from(height) / f64::from(recorded.height));

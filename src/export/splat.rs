@@ -6,7 +6,7 @@ use std::path::Path;
 use glam::{Quat, Vec3};
 
 use super::{ExportError, FileSize, FormatRow};
-use crate::splat::{Gaussian, GaussianCloud, ShDegree, raw_opacity_from_opacity, sh::dc_from_color};
+use crate::splat::{Gaussian, GaussianCloud, ShDegree, raw_opacity_of_byte, sh::dc_from_color};
 
 /// The format's row in the table of formats.
 pub(super) const FORMAT: FormatRow = FormatRow {
@@ -22,8 +22,6 @@ pub(super) const FORMAT: FormatRow = FormatRow {
 
 /// Position and extents as floats, four bytes of colour, four of the rotation.
 const STRIDE: usize = 32;
-/// Opacities of the bytes 0 and 255, whose logits would not be finite.
-const OPACITIES: (f32, f32) = (1.0 / 1024.0, 1.0 - 1.0 / 1024.0);
 /// A flat Gaussian's least extent, metres: its logarithm would not be finite.
 const LEAST_EXTENT: f32 = 1e-9;
 
@@ -66,7 +64,7 @@ fn gaussian(bytes: &[u8; STRIDE]) -> Gaussian {
         mean: vector(0),
         log_scale: vector(12).max(Vec3::splat(LEAST_EXTENT)).map(f32::ln),
         rotation: if rotation.length_squared() > 0.0 { rotation.normalize() } else { Quat::IDENTITY },
-        raw_opacity: raw_opacity_from_opacity(share(27).clamp(OPACITIES.0, OPACITIES.1)),
+        raw_opacity: raw_opacity_of_byte(bytes[27]),
         sh: vec![dc_from_color(Vec3::new(share(24), share(25), share(26)))],
     }
 }

@@ -15,7 +15,7 @@ use super::axes::turned;
 use super::harmonics::fit_harmonics;
 use super::{ExportError, FileSize, FormatRow, spz4};
 use crate::geometry::Se3;
-use crate::splat::{Gaussian, GaussianCloud, ShDegree, opacity_from_raw, raw_opacity_from_opacity, unit_rotation};
+use crate::splat::{Gaussian, GaussianCloud, ShDegree, opacity_from_raw, raw_opacity_of_byte, unit_rotation};
 
 /// The format's row in the table of formats.
 pub(super) const FORMAT: FormatRow = FormatRow {
@@ -49,8 +49,6 @@ const LOG_SCALE: (f32, f32) = (10.0, 16.0);
 pub(super) const MOST_GAUSSIANS: u64 = 10_000_000;
 /// A compressed byte stands for no more than this.
 const MOST_INFLATION: u64 = 1032;
-/// Opacities of the bytes 0 and 255, whose logits would not be finite.
-const OPACITIES: (f32, f32) = (1.0 / 1024.0, 1.0 - 1.0 / 1024.0);
 
 /// Bytes of a Gaussian in a version.
 fn stride(version: u32, degree: ShDegree) -> usize {
@@ -218,7 +216,6 @@ pub(super) fn unpack(bytes: &[u8], count: usize, version: u32, degree: ShDegree,
             (f64::from(fixed) / 2f64.powi(bits)) as f32
         };
         let rotation = &rotations[rotation_bytes * i..rotation_bytes * (i + 1)];
-        let opacity = (f32::from(opacities[i]) / 255.0).clamp(OPACITIES.0, OPACITIES.1);
         let constant = (triple(colors, 3 * i) / 255.0 - 0.5) / COLOR_SCALE;
         let beyond = (0..harmonics).map(|k| (triple(sh, 3 * (i * harmonics + k)) - 128.0) / 128.0);
         cloud.push(Gaussian {
@@ -228,7 +225,7 @@ pub(super) fn unpack(bytes: &[u8], count: usize, version: u32, degree: ShDegree,
                 [a, b, c, d] => from_smallest_three(u32::from_le_bytes([*a, *b, *c, *d])),
                 three => from_first_three(three),
             },
-            raw_opacity: raw_opacity_from_opacity(opacity),
+            raw_opacity: raw_opacity_of_byte(opacities[i]),
             sh: std::iter::once(constant).chain(beyond).collect(),
         });
     }

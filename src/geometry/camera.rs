@@ -24,6 +24,14 @@ pub struct Pinhole {
 }
 
 impl Pinhole {
+    /// The camera of views whose own is not known: 640×480 pixels, 60° wide.
+    pub fn assumed() -> Self {
+        let (width, height) = (640, 480);
+        let focal = 0.5 * f64::from(width) / 30f64.to_radians().tan();
+        let centre = |side: u32| 0.5 * (f64::from(side) - 1.0);
+        Self { fx: focal, fy: focal, cx: centre(width), cy: centre(height), width, height }
+    }
+
     /// Projects a point in the camera frame (metres) to pixels; `None` at or behind the camera's plane.
     pub fn project(&self, p_in_camera: &Vector3<f64>) -> Option<Vector2<f64>> {
         (p_in_camera.z > 1e-6).then(|| {

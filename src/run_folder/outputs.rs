@@ -113,8 +113,11 @@ pub fn map_name(format: MapFormat) -> String {
     format!("map.{}", format.extension())
 }
 
-/// The map in a run's folder and its format, if there is one.
+/// The map in a run's folder, or the file itself, and its format, if there is one.
 pub fn find_map(folder: &Path) -> Option<(PathBuf, MapFormat)> {
+    if !folder.is_dir() {
+        return MapFormat::of_path(folder).map(|format| (folder.into(), format));
+    }
     let in_folder = |format: &MapFormat| (folder.join(map_name(*format)), *format);
     MapFormat::all().iter().map(in_folder).find(|(path, _)| path.is_file())
 }

@@ -21,8 +21,6 @@ use crate::splat::ViewCamera;
 const LEAST_ALPHA: f32 = 0.5;
 /// Fewer pixels show no surface.
 const LEAST_SCALE: f64 = 0.05;
-/// Without the recording, views have this size and this horizontal field of view, degrees.
-const UNKNOWN: (u32, u32, f64) = (640, 480, 60.0);
 
 /// What is fused, and how.
 #[derive(Clone, Debug, Default)]
@@ -79,7 +77,7 @@ pub fn mesh_folder(
     let cloud = format.read(&map).map_err(OutputError::from)?;
     let recording = open_recording(folder, options)?;
     let sensor = recording.as_ref().map(|recording| Measured::new(recording, folder, options)).transpose()?;
-    let pinhole = sensor.as_ref().map_or_else(unknown_pinhole, |sensor| sensor.pinhole);
+    let pinhole = sensor.as_ref().map_or_else(Pinhole::assumed, |sensor| sensor.pinhole);
     let frames = frame_of_pose(recording.as_ref(), &poses);
     let gpu = Gpu::open(options.adapter.as_deref())?;
     let on_gpu = GpuCloud::of(&gpu, &cloud)?;
@@ -123,13 +121,6 @@ fn open_recording(folder: &Path, options: &MeshOptions) -> Result<Option<Recordi
     let recording =
         config.and_then(|config| Recording::open(config).map_err(|error| tracing::warn!("without the recording: {error}")).ok());
     Ok(recording)
-}
-
-fn unknown_pinhole() -> Pinhole {
-    let (width, height, degrees) = UNKNOWN;
-    let focal = 0.5 * f64::from(width) / (0.5 * degrees.to_radians()).tan();
-    let centre = |side: u32| 0.5 * (f64::from(side) - 1.0);
-    Pinhole { fx: focal, fy: focal, cx: centre(width), cy: centre(height), width, height }
 }
 
 /// What the sensor measured, without the lens and without the bias that the run found.

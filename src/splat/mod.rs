@@ -165,6 +165,12 @@ pub fn raw_opacity_from_opacity(opacity: f32) -> f32 {
     (opacity / (1.0 - opacity)).ln()
 }
 
+/// Raw opacity of an opacity in 255ths. Those of the bytes 0 and 255 stay finite.
+pub fn raw_opacity_of_byte(byte: u8) -> f32 {
+    const LEAST: f32 = 1.0 / 1024.0;
+    raw_opacity_from_opacity((f32::from(byte) / 255.0).clamp(LEAST, 1.0 - LEAST))
+}
+
 /// The sigmoid: opacity of a raw opacity.
 pub fn opacity_from_raw(raw_opacity: f32) -> f32 {
     1.0 / (1.0 + (-raw_opacity).exp())

@@ -35,8 +35,6 @@ const META: &str = "meta.json";
 const ENTRIES_A_ROW: usize = 64;
 /// The byte of a rotation whose largest component is w; x, y and z follow.
 const LARGEST: u8 = 252;
-/// Opacities of the bytes 0 and 255, whose logits would not be finite.
-const OPACITIES: (f32, f32) = (1.0 / 1024.0, 1.0 - 1.0 / 1024.0);
 /// Largest code of a position's 16 bits.
 const MOST_CODE: f64 = 65535.0;
 

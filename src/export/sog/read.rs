@@ -8,9 +8,9 @@ use serde::Deserialize;
 
 use super::bundle::{Plane, Reader};
 use super::palette::MOST_ENTRIES;
-use super::{Coded, ENTRIES_A_ROW, LARGEST, META, MOST_CODE, Meta, OPACITIES, Palette, VERSION, expanded};
+use super::{Coded, ENTRIES_A_ROW, LARGEST, META, MOST_CODE, Meta, Palette, VERSION, expanded};
 use crate::export::{ExportError, FileSize};
-use crate::splat::{Gaussian, GaussianCloud, ShDegree, raw_opacity_from_opacity};
+use crate::splat::{Gaussian, GaussianCloud, ShDegree, raw_opacity_of_byte};
 
 /// Gaussians per byte of a file, at most: honest ones take ten bytes and more, unless few of them are all alike.
 const MOST_PER_BYTE: u64 = 4;
@@ -49,7 +49,6 @@ fn unpack(bytes: &[u8]) -> Result<GaussianCloud, String> {
     let degree = harmonics.as_ref().map_or(ShDegree::default(), |harmonics| harmonics.degree);
     let mut cloud = GaussianCloud { antialiased: meta.antialias, ..GaussianCloud::new(degree) };
     for i in 0..count {
-        let opacity = (f32::from(colors.plane.pixels[i][3]) / 255.0).clamp(OPACITIES.0, OPACITIES.1);
         let mut sh = vec![colors.of(i)?];
         if let Some(harmonics) = &harmonics {
             sh.extend(harmonics.of(i)?);
@@ -58,7 +57,7 @@ fn unpack(bytes: &[u8]) -> Result<GaussianCloud, String> {
             mean: mean(&meta, [means[0].pixels[i], means[1].pixels[i]]),
             log_scale: scales.of(i)?,
             rotation: rotation(quats.pixels[i]).ok_or_else(|| format!("the rotation of Gaussian {i} is none"))?,
-            raw_opacity: raw_opacity_from_opacity(opacity),
+            raw_opacity: raw_opacity_of_byte(colors.plane.pixels[i][3]),
             sh,
         });
     }

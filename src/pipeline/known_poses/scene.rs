@@ -11,7 +11,7 @@ use glam::Vec3;
 use nalgebra::{Point3, Vector2, Vector3};
 use rayon::prelude::*;
 
-use crate::export::{ExportFilter, MapFormat};
+use crate::export::ExportFilter;
 use crate::geometry::Se3;
 use crate::mapping::MappingConfig;
 use crate::pipeline::{PipelineError, Progress};
@@ -139,9 +139,7 @@ impl<'a> Scene<'a> {
 
 /// The map of a file or of a run's folder: of more Gaussians than the mapper may have, those that cover most.
 fn initial_map(path: &Path, recording: &Recording) -> Result<Arc<GaussianCloud>, PipelineError> {
-    let found =
-        if path.is_dir() { outputs::find_map(path) } else { MapFormat::of_path(path).map(|format| (path.into(), format)) };
-    let (path, format) = found.ok_or_else(|| PipelineError::NoInitialMap { path: path.into() })?;
+    let (path, format) = outputs::find_map(path).ok_or_else(|| PipelineError::NoInitialMap { path: path.into() })?;
     let map = format.read(&path)?;
     if map.is_empty() {
         return Err(PipelineError::EmptyInitialMap { path });
