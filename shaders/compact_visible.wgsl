@@ -35,7 +35,7 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
     for (var before = 0u; before < word; before++) {
         to += countOneBits(atomicLoad(&masks[before]));
     }
-    depth_keys[to] = depth_key(projected[3u * i].z);
+    depth_keys[to] = depth_key(projected[PROJECTED * i].z);
     indices[to] = i;
     intersection_counts[3u * view.capacity + to] = i;
 }

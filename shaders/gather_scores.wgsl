@@ -41,7 +41,7 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
     let values = 3.0 * setup.pixels;
     let loss = (1.0 - setup.ssim_weight) * total.x / values + setup.ssim_weight * (1.0 - total.y / values);
     let per_unit = 0.5 * vec2(f32(view.width), f32(view.height));
-    let metres_per_pixel = projected[3u * i].z / view.intrinsics.x;
+    let metres_per_pixel = projected[PROJECTED * i].z / view.intrinsics.x;
     let before = scores[view.capacity + i];
     let finest = select(metres_per_pixel, min(before.w, metres_per_pixel), before.z > 0.0);
     let seen_before = scores[i];

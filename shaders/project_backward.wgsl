@@ -41,7 +41,30 @@ fn backward(i: u32) {
     let unit_rotation = rotation * inverse_norm;
     let projection = project_gaussian(view, mean_opacity.xyz, log_scale, unit_rotation);
 
-    let by_mean_2d = inverse_covariance(projection, first.yz);
+    var by_mean_2d = inverse_covariance(projection, first.yz);
+    //# planar
+    // A Gaussian's depth at a pixel is z + slope·d. With n = Σ_j share_j·a_j(a_j·p) over its axes, shares falling with the square of the scales:
+    let axes = unit_axes(view, unit_rotation);
+    let plane = plane_of(projection, axes);
+    let by_slope = vec2(first.w, second.w) / view.intrinsics.xy;
+    let p_z = projection.p_in_camera.z;
+    by_mean_2d -= plane.slant * p_z / view.intrinsics.xy * color_depth.w;
+    let by_slant = by_slope * p_z * plane.inside;
+    let ray = projection.p_in_camera / p_z;
+    let across = 1.0 / dot(plane.normal, ray);
+    let turned = dot(by_slant, plane.slant) * across;
+    let by_normal = -vec3(by_slant * across, 0.0) - turned * ray;
+    let by_ray = -turned * plane.normal;
+    let normal_along = by_normal * axes;
+    let by_log_scale = -2.0 * plane.shares * plane.along * normal_along;
+    let by_axes = mat3x3(
+        plane.shares.x * (by_normal * plane.along.x + projection.p_in_camera * normal_along.x),
+        plane.shares.y * (by_normal * plane.along.y + projection.p_in_camera * normal_along.y),
+        plane.shares.z * (by_normal * plane.along.z + projection.p_in_camera * normal_along.z),
+    );
+    let by_plane_point =
+        axes * (plane.shares * normal_along) + vec3(by_ray.xy / p_z, dot(by_slope, plane.slant) - dot(by_ray.xy, ray.xy) / p_z);
+    //# end
     // log α = -½dᵀPd + …, P = Σ⁻¹: its gradient G by P is -½Σ q d·dᵀ, and by Σ it is -P·G·P. With T the image axes, Σ = T·Tᵀ + …, so
     // that by column t it is -2P·(G·(P·t)), and by the logarithm of that axis' scale -2(P·t)·G·(P·t).
     let by_inverse = -0.5 * second.xyz;
@@ -56,11 +79,14 @@ fn backward(i: u32) {
     let is_compensated = projection.sharp_determinant > LEAST_UNDILUTED * projection.determinant;
     let by_compensation = select(0.0, view.antialiased * first.x / projection.sharp_determinant, is_compensated);
     let part = by_compensation * vec2(projection.determinant - projection.sharp_determinant, projection.dilation);
-    let by_smoothed = vec3(
+    var by_smoothed = vec3(
         dot(p_0, part.x * projection.image_axis_0 - 2.0 * g_0) - part.y * dot(projection.image_axis_0, projection.image_axis_0),
         dot(p_1, part.x * projection.image_axis_1 - 2.0 * g_1) - part.y * dot(projection.image_axis_1, projection.image_axis_1),
         dot(p_2, part.x * projection.image_axis_2 - 2.0 * g_2) - part.y * dot(projection.image_axis_2, projection.image_axis_2),
     );
+    //# planar
+    by_smoothed += by_log_scale;
+    //# end
     let by_image_0 = inverse_covariance(projection, part.x * projection.image_axis_0 - 2.0 * g_0) - part.y * projection.image_axis_0;
     let by_image_1 = inverse_covariance(projection, part.x * projection.image_axis_1 - 2.0 * g_1) - part.y * projection.image_axis_1;
     let by_image_2 = inverse_covariance(projection, part.x * projection.image_axis_2 - 2.0 * g_2) - part.y * projection.image_axis_2;
@@ -70,17 +96,25 @@ fn backward(i: u32) {
 
     // T = J·M: gradients by M's columns, and by J's rows.
     let scale = projection.scale;
-    let by_rotation_matrix = mat3x3(
+    var by_rotation_matrix = mat3x3(
         rotate_to_world(view, projection.jacobian_x * by_image_0.x + projection.jacobian_y * by_image_0.y) * scale.x,
         rotate_to_world(view, projection.jacobian_x * by_image_1.x + projection.jacobian_y * by_image_1.y) * scale.y,
         rotate_to_world(view, projection.jacobian_x * by_image_2.x + projection.jacobian_y * by_image_2.y) * scale.z,
     );
+    //# planar
+    by_rotation_matrix[0] += rotate_to_world(view, by_axes[0]);
+    by_rotation_matrix[1] += rotate_to_world(view, by_axes[1]);
+    by_rotation_matrix[2] += rotate_to_world(view, by_axes[2]);
+    //# end
     let by_unit = quaternion_gradient(unit_rotation, by_rotation_matrix);
     store_gradient(2u, i, (by_unit - unit_rotation * dot(unit_rotation, by_unit)) * inverse_norm);
 
     let by_jacobian_x = projection.axes_in_camera * vec3(by_image_0.x, by_image_1.x, by_image_2.x);
     let by_jacobian_y = projection.axes_in_camera * vec3(by_image_0.y, by_image_1.y, by_image_2.y);
-    let by_point = point_gradient(projection, by_mean_2d, color_depth.w, by_jacobian_x, by_jacobian_y);
+    var by_point = point_gradient(projection, by_mean_2d, color_depth.w, by_jacobian_x, by_jacobian_y);
+    //# planar
+    by_point += by_plane_point;
+    //# end
     let by_mean_of_color = color_gradient(i, mean_opacity.xyz, color_depth.xyz);
     let opacity = sigmoid(mean_opacity.w);
     let by_mean = rotate_to_world(view, by_point) + by_mean_of_color;

@@ -4,8 +4,8 @@
 @group(0) @binding(0) var<uniform> view: View;
 // [planes, capacity], see `render::GpuCloud`.
 @group(0) @binding(1) var<storage, read> parameters: array<vec4<f32>>;
-// [N, 3]: (mean x, mean y, depth, cut), (conic_factor xx, xy, yy, opacity),
-// (r, g, b, half extents of the ellipse in pixels as two f16).
+// [N, PROJECTED]: (mean x, mean y, depth, cut), (conic_factor xx, xy, yy, opacity),
+// (r, g, b, half extents of the ellipse in pixels as two f16); of a planar surface also (depth's slope, metres a pixel along x and y, -, -).
 @group(0) @binding(2) var<storage, read_write> projected: array<vec4<f32>>;
 // [N] 1 where the Gaussian may touch the image.
 @group(0) @binding(3) var<storage, read_write> visible: array<u32>;
@@ -85,9 +85,13 @@ fn project(i: u32) -> bool {
     if !all(seen < vec3(MAX_COLOR)) {
         return false;
     }
-    projected[3u * i] = vec4(mean, depth, cut);
-    projected[3u * i + 1u] = vec4(conic_factor(projection), seen_opacity);
-    projected[3u * i + 2u] = vec4(seen, bitcast<f32>(pack2x16float(min(half_extent * EXTENT_SLACK, vec2(MAX_EXTENT)))));
+    projected[PROJECTED * i] = vec4(mean, depth, cut);
+    projected[PROJECTED * i + 1u] = vec4(conic_factor(projection), seen_opacity);
+    projected[PROJECTED * i + 2u] = vec4(seen, bitcast<f32>(pack2x16float(min(half_extent * EXTENT_SLACK, vec2(MAX_EXTENT)))));
+    //# planar
+    let plane = plane_of(projection, unit_axes(view, rotation * inverseSqrt(norm_squared)));
+    projected[PROJECTED * i + 3u] = vec4(plane.slant * p.z / view.intrinsics.xy, 0.0, 0.0);
+    //# end
     return true;
 }
 

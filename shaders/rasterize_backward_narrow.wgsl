@@ -30,7 +30,7 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
             let chunk_end = min(blended, chunk + CHUNK);
             for (var k = chunk; k < chunk_end; k++) {
                 let at = place.member * BATCH + k - start;
-                let gaussian = Listed(batch_mean[at], batch_conic_factor[at], batch_color[at], k);
+                let gaussian = listed(at, k);
                 var sum = IntersectionGradient(vec4(0.0), vec4(0.0), vec4(0.0));
                 for (var s = 0u; s < STRIPS; s++) {
                     var strip = pixels[s];

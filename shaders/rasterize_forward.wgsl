@@ -1,8 +1,9 @@
 // Blends the tiles' Gaussians front to back into colour, depth and transmittance (Kerbl et al. 2023, eq. 3).
 
-// [H, W] (r, g, b, Σ w z): colour over the background, depth weighted by what was blended. Behind it, in the wide form, checkpoints for the backward pass,
-// [buckets, 5, TILE_THREADS]: where a bucket of BUCKET Gaussians begins within a tile's list, what each strip has blended before it: red, green, blue, depth,
-// transmittance. Its number is its first place in the sorted list over BUCKET.
+// [H, W] (r, g, b, Σ w z): colour over the background, depth weighted by what was blended. Of a planar surface, depth is that of each Gaussian's plane at the
+// pixel, and [H, W] (Σ w slope x, Σ w slope y, Σ w z², median depth) follows. Behind it, in the wide form, checkpoints for the backward pass,
+// [buckets, CHECKPOINT, TILE_THREADS]: where a bucket of BUCKET Gaussians begins within a tile's list, what each strip has blended before it: red, green, blue,
+// depth, transmittance, and of a planar surface both slopes and z². Its number is its first place in the sorted list over BUCKET.
 @group(0) @binding(5) var<storage, read_write> color_depth: array<vec4<f32>>;
 // [H, W] (bits of the transmittance, intersections of the tile's list up to and with the last one blended).
 @group(0) @binding(6) var<storage, read_write> state: array<vec2<u32>>;
@@ -17,6 +18,13 @@ struct Blended {
     green: vec4<f32>,
     blue: vec4<f32>,
     depth: vec4<f32>,
+    //# planar
+    slope_x: vec4<f32>,
+    slope_y: vec4<f32>,
+    squared_depth: vec4<f32>,
+    // Depth of the Gaussian behind which less than half of the light is left.
+    median_depth: vec4<f32>,
+    //# end
     transmittance: vec4<f32>,
     last: vec4<u32>,
     // Whether the pixel takes more.
@@ -56,12 +64,17 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
             break;
         }
         if STRIPS == 1u && start > 0u && start % BUCKET == 0u {
-            let to = view.width * view.height + (place.range.x + start) / BUCKET * 5u * TILE_THREADS + place.thread;
+            let to = IMAGE_PLANES * view.width * view.height + (place.range.x + start) / BUCKET * CHECKPOINT * TILE_THREADS + place.thread;
             color_depth[to] = blended[0].red;
             color_depth[to + TILE_THREADS] = blended[0].green;
             color_depth[to + 2u * TILE_THREADS] = blended[0].blue;
             color_depth[to + 3u * TILE_THREADS] = blended[0].depth;
             color_depth[to + 4u * TILE_THREADS] = blended[0].transmittance;
+            //# planar
+            color_depth[to + 5u * TILE_THREADS] = blended[0].slope_x;
+            color_depth[to + 6u * TILE_THREADS] = blended[0].slope_y;
+            color_depth[to + 7u * TILE_THREADS] = blended[0].squared_depth;
+            //# end
         }
         load_batch(place, start, count);
         workgroupBarrier();
@@ -76,7 +89,19 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
                 let u = along + shape.y * dy;
                 let v = shape.z * dy;
                 var strip = blended[s];
-                blend(u * u + v * v, mean, shape.w, color, k + 1u, &strip);
+                var depth = vec4(mean.z);
+                //# planar
+                let slope = batch_slope[at];
+                depth += slope.x * (block.x - mean.x) + slope.y * dy;
+                let before = strip.transmittance;
+                //# end
+                let weight = blend(u * u + v * v, mean.w, shape.w, color, depth, k + 1u, &strip);
+                //# planar
+                strip.slope_x += weight * slope.x;
+                strip.slope_y += weight * slope.y;
+                strip.squared_depth += weight * depth * depth;
+                strip.median_depth = select(strip.median_depth, depth, (weight > vec4(0.0)) & (before > vec4(0.5)));
+                //# end
                 blended[s] = strip;
             }
         }
@@ -88,16 +113,28 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
                 let at = block.first + s * view.width + p;
                 let color = vec3(done.red[p], done.green[p], done.blue[p]) + done.transmittance[p] * view.background.xyz;
                 color_depth[at] = vec4(color, done.depth[p]);
+                //# planar
+                color_depth[view.width * view.height + at] =
+                    vec4(done.slope_x[p], done.slope_y[p], done.squared_depth[p], done.median_depth[p]);
+                //# end
                 state[at] = vec2(bitcast<u32>(done.transmittance[p]), done.last[p]);
             }
         }
     }
 }
 
-// Blends one Gaussian, the `number`-th of the tile, into a strip; `distance` is ½dᵀΣ⁻¹d: alpha is opacity·exp(-that). Nothing is left out by branches:
-// the narrow form's adapters would run both sides.
-fn blend(distance: vec4<f32>, mean: vec4<f32>, opacity: f32, color: vec4<f32>, number: u32, to: ptr<function, Blended>) {
-    let hit = (*to).open & (distance <= vec4(mean.w));
+// Blends one Gaussian, the `number`-th of the tile, into a strip, and returns its weight there; `distance` is ½dᵀΣ⁻¹d: alpha is opacity·exp(-that), down to the
+// cut. Nothing is left out by branches: the narrow form's adapters would run both sides.
+fn blend(
+    distance: vec4<f32>,
+    cut: f32,
+    opacity: f32,
+    color: vec4<f32>,
+    depth: vec4<f32>,
+    number: u32,
+    to: ptr<function, Blended>,
+) -> vec4<f32> {
+    let hit = (*to).open & (distance <= vec4(cut));
     let alpha = min(vec4(ALPHA_MAX), opacity * exp(-distance));
     let next = (*to).transmittance * (1.0 - alpha);
     let stop = hit & (next < vec4(TRANSMITTANCE_MIN));
@@ -107,7 +144,8 @@ fn blend(distance: vec4<f32>, mean: vec4<f32>, opacity: f32, color: vec4<f32>, n
     (*to).red += weight * color.x;
     (*to).green += weight * color.y;
     (*to).blue += weight * color.z;
-    (*to).depth += weight * mean.z;
+    (*to).depth += weight * depth;
     (*to).transmittance = select((*to).transmittance, next, taken);
     (*to).last = select((*to).last, vec4(number), taken);
+    return weight;
 }

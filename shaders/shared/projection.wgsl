@@ -103,6 +103,42 @@ fn across(t: vec2<f32>, v: vec2<f32>) -> vec2<f32> {
     return perpendicular * dot(perpendicular, v);
 }
 
+//# planar
+// The plane that stands for a Gaussian where rays are dense in it (RaDe-GS, Zhang et al. 2024): along the ray r of each pixel its density is largest at
+// z(r) = (rᵀΛp)/(rᵀΛr), Λ the inverse of its covariance, p its mean. That is linear about the mean: dz = z·slant·dr, slant = -n_xy/(n·r), n = Λp. Of a flat
+// Gaussian, n is the normal and this its plane; of a round one, the plane across the ray.
+struct Plane {
+    slant: vec2<f32>,
+    // 1 where the slant is within its bounds, 0 where clamped.
+    inside: vec2<f32>,
+    // n, times the square of the thinnest axis; and its share of each axis: Λ's own value there, times the same.
+    normal: vec3<f32>,
+    shares: vec3<f32>,
+    // The mean along each axis, metres.
+    along: vec3<f32>,
+}
+
+// Axes of a Gaussian in the camera frame, of length one.
+fn unit_axes(view_: View, unit_rotation: vec4<f32>) -> mat3x3<f32> {
+    let axes = rotation_matrix(unit_rotation);
+    return mat3x3(rotate_to_camera(view_, axes[0]), rotate_to_camera(view_, axes[1]), rotate_to_camera(view_, axes[2]));
+}
+
+fn plane_of(projection: Projection, axes: mat3x3<f32>) -> Plane {
+    var out: Plane;
+    let scale = max(projection.scale, vec3(LEAST_SCALE));
+    let ratios = min(min(scale.x, scale.y), scale.z) / scale;
+    out.shares = ratios * ratios;
+    out.along = projection.p_in_camera * axes;
+    out.normal = axes * (out.shares * out.along);
+    let p = projection.p_in_camera;
+    let slant = -out.normal.xy * p.z / dot(out.normal, p);
+    out.slant = clamp(slant, vec2(-MOST_SLANT), vec2(MOST_SLANT));
+    out.inside = select(vec2(0.0), vec2(1.0), slant == out.slant);
+    return out;
+}
+//# end
+
 fn sigmoid(x: f32) -> f32 {
     return 1.0 / (1.0 + exp(-x));
 }

@@ -15,6 +15,8 @@ struct AdamSetup {
     step_harmonics: u32,
     // Logarithm of how many times longer than its second axis a Gaussian's longest may become.
     log_elongation: f32,
+    // Logarithm of the share of its second axis to which its shortest shrinks; beyond all logarithms where there is none.
+    log_thickness: f32,
     // Inverse of the number of steps with whose root the steps of colours shrink; 0: they don't.
     color_settling: f32,
     // Least share that the present parameters have in their averages.
@@ -81,6 +83,18 @@ fn blunt(log_scale: vec4<f32>) -> vec4<f32> {
     return vec4(min(log_scale.xyz, vec3(second + adam.log_elongation)), least_interval(log_scale.w));
 }
 
+// Log scales of which the shortest comes nearer to its share of the second, by one step of their rate at least.
+fn flatten(before: vec4<f32>, log_scale: vec4<f32>) -> vec4<f32> {
+    let longest = max(max(log_scale.x, log_scale.y), log_scale.z);
+    let shortest = min(min(log_scale.x, log_scale.y), log_scale.z);
+    let second = log_scale.x + log_scale.y + log_scale.z - longest - shortest;
+    let flat = min(log_scale.xyz, max(vec3(second + adam.log_thickness), before.xyz - adam.rates[1].x));
+    // Of equal axes the last is the shortest: insertion has the normal there.
+    let is_shortest = log_scale.xyz == vec3(shortest);
+    let is_last = vec3(is_shortest.x && !is_shortest.y && !is_shortest.z, is_shortest.y && !is_shortest.z, is_shortest.z);
+    return vec4(select(log_scale.xyz, flat, is_last), log_scale.w);
+}
+
 fn store_gradient(plane: u32, i: u32, raw: vec4<f32>) {
     let at = plane * view.capacity + i;
     let correction = select(corrections, corrections_of_harmonics, plane > 3u);
@@ -92,7 +106,7 @@ fn store_gradient(plane: u32, i: u32, raw: vec4<f32>) {
     let unit = select(vec4(1.0), vec4(size, size, size, 1.0), plane == 0u);
     let rate = adam.rates[min(plane, 4u)] * unit * correction.x * select(color_pace, 1.0, plane < 3u);
     let moved = parameters[at] - rate * m / (sqrt(v * correction.y) + adam.epsilon);
-    let now = select(moved, blunt(moved), plane == 1u);
+    let now = select(moved, flatten(parameters[at], blunt(moved)), plane == 1u);
     parameters[at] = now;
     let average = averages[at];
     let mean = mix(average, now, share);

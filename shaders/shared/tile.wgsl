@@ -7,7 +7,7 @@
 @group(0) @binding(1) var<storage, read> ranges: array<vec2<u32>>;
 @group(0) @binding(2) var<storage, read> sorted_slots: array<u32>;
 @group(0) @binding(3) var<storage, read> slot_gaussians: array<u32>;
-// [N, 3], see `project_forward`.
+// [N, PROJECTED], see `project_forward`.
 @group(0) @binding(4) var<storage, read> projected: array<vec4<f32>>;
 
 const BLOCKS_ACROSS: u32 = TILE_WIDTH / 4u;
@@ -18,6 +18,9 @@ const BATCH: u32 = 64u;
 var<workgroup> batch_mean: array<vec4<f32>, BATCH * GROUP_TILES>;
 var<workgroup> batch_conic_factor: array<vec4<f32>, BATCH * GROUP_TILES>;
 var<workgroup> batch_color: array<vec4<f32>, BATCH * GROUP_TILES>;
+//# planar
+var<workgroup> batch_slope: array<vec2<f32>, BATCH * GROUP_TILES>;
+//# end
 
 // An invocation's place: its tile, the tile's number in the workgroup, its own in the tile, and the tile's intersections in the sorted list. Beyond the last tile
 // there are no intersections and no pixels.
@@ -70,8 +73,11 @@ fn load_batch(place: Place, start: u32, end: u32) {
     let to = place.member * BATCH;
     for (var k = place.thread; start + k < min(end, start + BATCH); k += TILE_THREADS) {
         let gaussian = slot_gaussians[sorted_slots[place.range.x + start + k]];
-        batch_mean[to + k] = projected[3u * gaussian];
-        batch_conic_factor[to + k] = projected[3u * gaussian + 1u];
-        batch_color[to + k] = projected[3u * gaussian + 2u];
+        batch_mean[to + k] = projected[PROJECTED * gaussian];
+        batch_conic_factor[to + k] = projected[PROJECTED * gaussian + 1u];
+        batch_color[to + k] = projected[PROJECTED * gaussian + 2u];
+        //# planar
+        batch_slope[to + k] = projected[PROJECTED * gaussian + 3u].xy;
+        //# end
     }
 }

@@ -42,9 +42,9 @@ struct Outline {
 
 // Pixel centres are integers, so a tile's pixels span [first, first + size - 1].
 fn outline_of(gaussian: u32) -> Outline {
-    let mean_cut = projected[3u * gaussian];
-    let factor = projected[3u * gaussian + 1u].xyz;
-    let half_extent = unpack2x16float(bitcast<u32>(projected[3u * gaussian + 2u].w)).y;
+    let mean_cut = projected[PROJECTED * gaussian];
+    let factor = projected[PROJECTED * gaussian + 1u].xyz;
+    let half_extent = unpack2x16float(bitcast<u32>(projected[PROJECTED * gaussian + 2u].w)).y;
     let limit = mean_cut.w * (1.0 + SLACK) + SLACK;
     let rightmost = -factor.y / factor.z * sqrt(limit) * inverseSqrt(factor.y * factor.y + factor.z * factor.z);
     let bounds = floor(vec2(mean_cut.y - half_extent, mean_cut.y + half_extent) / TILE_SIZE.y);

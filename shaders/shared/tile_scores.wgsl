@@ -45,9 +45,10 @@ fn error_pixels(place: Place, strip: u32, threshold: f32) -> vec4<f32> {
 fn add_score(gaussian: Listed, x: vec4<f32>, y: f32, is_error: vec4<f32>, pixels: ptr<function, PixelState>, sum: ptr<function, PairScore>) {
     let shape = gaussian.shape;
     let dy = y - gaussian.mean.y;
-    let u = shape.x * (x - gaussian.mean.x) + shape.y * dy;
+    let dx = x - gaussian.mean.x;
+    let u = shape.x * dx + shape.y * dy;
     let v = shape.z * dy;
-    let passed = pass_gaussian(gaussian, u, v, pixels);
+    let passed = pass_gaussian(gaussian, dx, dy, pixels);
     let weight = passed.weight;
     let by_x = 2.0 * passed.q * shape.x * u;
     let by_y = 2.0 * passed.q * (shape.y * u + shape.z * v);

@@ -67,7 +67,13 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
     for (var step = 0u; step < end; step++) {
         if step % TILE_THREADS == 0u && step + local < count {
             let i = slot_gaussians[sorted_slots[first + step + local]];
-            next = Listed(projected[3u * i], projected[3u * i + 1u], projected[3u * i + 2u], bucket.start + step + local);
+            next.mean = projected[PROJECTED * i];
+            next.shape = projected[PROJECTED * i + 1u];
+            next.color = projected[PROJECTED * i + 2u];
+            next.position = bucket.start + step + local;
+            //# planar
+            next.slope = projected[PROJECTED * i + 3u].xy;
+            //# end
         }
         // Steps since invocation `local` began; it wraps before that, and is then beyond any list.
         let age = step - local;
@@ -97,11 +103,16 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
 
 // From the checkpoint (see `rasterize_forward`), takes a strip to where the forward pass was at the start of the bucket.
 fn resume(pixels: ptr<function, PixelState>, bucket: u32, local: u32) {
-    let at = view.width * view.height + bucket * 5u * TILE_THREADS + local;
+    let at = IMAGE_PLANES * view.width * view.height + bucket * CHECKPOINT * TILE_THREADS + local;
     let red = color_depth[at] * (*pixels).red;
     let green = color_depth[at + TILE_THREADS] * (*pixels).green;
     let blue = color_depth[at + 2u * TILE_THREADS] * (*pixels).blue;
     let depth = color_depth[at + 3u * TILE_THREADS] * (*pixels).depth;
     (*pixels).behind -= red + green + blue + depth;
+    //# planar
+    let slope_x = color_depth[at + 5u * TILE_THREADS] * (*pixels).slope_x;
+    let slope_y = color_depth[at + 6u * TILE_THREADS] * (*pixels).slope_y;
+    (*pixels).behind -= slope_x + slope_y + color_depth[at + 7u * TILE_THREADS] * (*pixels).squared_depth;
+    //# end
     (*pixels).transmittance = color_depth[at + 4u * TILE_THREADS];
 }

@@ -93,7 +93,7 @@ impl StepRunner {
     /// # Errors
     /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn new(gpu: &Arc<Gpu>, scene: BenchScene, form: BlendForm) -> Result<Self, GpuError> {
-        let mut trainer = Trainer::with_form(gpu.clone(), form)?;
+        let mut trainer = Trainer::with_blending(gpu.clone(), form)?;
         let work = count_work(&mut trainer, &scene.cloud, &scene.camera)?;
         // Rates of zero keep the scene as it is, step after step, at the same cost.
         let still = AdamConfig::default().scaled(0.0, 0.0);

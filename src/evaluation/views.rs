@@ -248,6 +248,7 @@ mod tests {
             height: SIZE,
             color_depth: vec![[1.5, 0.2, -0.5, 1.0]; pixels],
             transmittance: vec![0.5; pixels],
+            surface: Vec::new(),
         };
         let bytes = to_rgb8(&rendered);
         assert!(bytes.dimensions() == (SIZE, SIZE) && bytes.pixels().all(|p| p.0 == [255, 51, 0]));
@@ -268,7 +269,7 @@ mod tests {
     #[test]
     fn pixels_are_bytes_row_by_row() {
         let color_depth = vec![[0.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
-        let image = to_rgb8(&Rendered { width: 2, height: 2, color_depth, transmittance: vec![0.0; 4] });
+        let image = to_rgb8(&Rendered { width: 2, height: 2, color_depth, transmittance: vec![0.0; 4], surface: Vec::new() });
         assert_eq!(image.into_raw(), [0, 0, 0, 255, 0, 0, 0, 255, 0, 0, 0, 255]);
     }
 }

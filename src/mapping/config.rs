@@ -3,8 +3,9 @@
 use serde::{Deserialize, Serialize};
 
 use super::{DensityConfig, ExposureConfig, LimitsConfig, PlaneSweepConfig};
-use crate::optimise::{AdamConfig, LossConfig};
+use crate::optimise::{AdamConfig, LossConfig, PlanarConfig};
 use crate::splat::ShDegree;
+use crate::splat::model::Surface;
 
 /// The mapper's configuration.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -14,6 +15,10 @@ pub struct MappingConfig {
     pub sh_degree: ShDegree,
     /// Whether the map has Mip-Splatting's filters, for views from much nearer or farther than the keyframes.
     pub antialiased: bool,
+    /// `volume`, or `planar` for surfaces: flat Gaussians, depth where rays meet their planes, and normals that agree with it.
+    pub surface: Surface,
+    /// Weights of a planar surface.
+    pub planar: PlanarConfig,
     /// Optimisation steps over the window after each keyframe, one view each. Most steps gain more in consolidation.
     pub iterations_per_keyframe: usize,
     /// Steps after the first keyframe, which has no map to start from.
@@ -50,6 +55,8 @@ impl Default for MappingConfig {
         Self {
             sh_degree: ShDegree::new(2).expect("degrees 0 to 3 exist"),
             antialiased: false,
+            surface: Surface::default(),
+            planar: PlanarConfig::default(),
             iterations_per_keyframe: 5,
             first_iterations: 50,
             yields_to_keyframes: false,
@@ -307,6 +314,7 @@ impl MappingConfig {
         self.exposure.validate().map_err(|e| format!("mapping.exposure: {e}"))?;
         self.plane_sweep.validate().map_err(|e| format!("mapping.plane_sweep: {e}"))?;
         self.density.validate().map_err(|e| format!("mapping.density: {e}"))?;
+        self.planar.validate().map_err(|e| format!("mapping.planar: {e}"))?;
         self.loss.validate().map_err(|e| format!("mapping.loss: {e}"))?;
         self.adam.validate().map_err(|e| format!("mapping.adam: {e}"))
     }

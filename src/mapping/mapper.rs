@@ -32,8 +32,9 @@ use super::{DensityConfig, InsertionConfig, Keyframe, KeyframeId, MappingConfig,
 use crate::geometry::Se3;
 use crate::gpu::Gpu;
 use crate::optimise::{AdamConfig, DensityPasses, OverScores, Survey, SurveyRules, Trainer, TrainingView};
-use crate::render::{GpuCloud, Rendered};
+use crate::render::{BlendForm, Blending, GpuCloud, Rendered};
 use crate::sequence::RectifiedImage;
+use crate::splat::model::Surface;
 use crate::splat::{Exposure, GaussianCloud, ViewCamera};
 
 /// Gaussians that there is room for at first; the map's buffers grow with it.
@@ -93,9 +94,13 @@ impl Mapper {
     /// # Errors
     /// [`MappingError`] if a buffer does not fit or the device fails.
     pub fn new(gpu: Arc<Gpu>, config: &MappingConfig) -> Result<Self, MappingError> {
+        let blending = Blending { form: BlendForm::of(&gpu), surface: config.surface };
+        let mut config = config.clone();
+        if config.surface == Surface::Planar {
+            config.insertion.thickness = config.insertion.thickness.min(config.planar.thickness);
+        }
         Ok(Self {
-            config: Arc::new(config.clone()),
-            trainer: Trainer::new(gpu.clone())?,
+            trainer: Trainer::with_blending(gpu.clone(), blending)?.with_planar(config.planar),
             cloud: GpuCloud::new(&gpu, config.sh_degree, FIRST_CAPACITY)?.with_antialiasing(config.antialiased),
             anchors: Anchors::default(),
             density: DensityPasses::new(&gpu)?,
@@ -106,6 +111,7 @@ impl Mapper {
             host_times: HostTimes::default(),
             epoch: Vec::new(),
             is_full: false,
+            config: Arc::new(config),
             gpu,
         })
     }

@@ -104,8 +104,8 @@ impl AdamConfig {
         }
     }
 
-    /// The GPU's copy for step number `step` of the map.
-    pub(super) fn setup(&self, step: usize) -> AdamSetup {
+    /// The GPU's copy for step number `step` of the map. The shortest axis shrinks to the `thickness`, in units of the second.
+    pub(super) fn setup(&self, step: usize, thickness: Option<f32>) -> AdamSetup {
         let p = self.lr_position;
         let rates = [
             [p, p, p, self.lr_opacity],
@@ -124,9 +124,10 @@ impl AdamConfig {
             log_beta_2: self.beta_2.ln(),
             step_harmonics: u32::from(step.is_multiple_of(self.harmonics_every)),
             log_elongation: self.max_elongation.ln(),
+            log_thickness: thickness.map_or(f32::MAX, f32::ln),
             color_settling: if self.color_settling_steps > 0.0 { 1.0 / self.color_settling_steps } else { 0.0 },
             least_share: 1.0 / self.ema_steps,
-            pad: [0.0; 3],
+            pad: [0.0; 2],
         }
     }
 }

@@ -28,13 +28,13 @@ pub(super) struct ImageBuffers {
 }
 
 impl ImageBuffers {
-    fn new(gpu: &Gpu, (width, height): (u32, u32)) -> Result<Self, GpuError> {
+    fn new(gpu: &Gpu, (width, height): (u32, u32), planes: u32) -> Result<Self, GpuError> {
         let tiles = width.div_ceil(LOSS_TILE) * height.div_ceil(LOSS_TILE);
         Ok(Self {
             size: (width, height),
             streamed: None,
             partials: GpuBuffer::storage(gpu, "loss partials", bordered_windows(width) * bordered_windows(height) * 48)?,
-            gradients: GpuBuffer::storage(gpu, "image gradients", u64::from(width * height) * 32)?,
+            gradients: GpuBuffer::storage(gpu, "image gradients", u64::from(width * height) * u64::from(planes) * 16)?,
             loss_sums: GpuBuffer::storage(gpu, "loss sums", u64::from(tiles) * 16)?,
         })
     }
@@ -56,10 +56,10 @@ impl ImageBuffers {
     }
 }
 
-/// Puts the buffers for `size` in front, made anew if they are not among the last few.
-pub(super) fn choose(kept: &mut Vec<ImageBuffers>, gpu: &Gpu, size: (u32, u32)) -> Result<(), GpuError> {
+/// Puts the buffers for `size` in front, made anew if they are not among the last few; gradients have so many `planes`.
+pub(super) fn choose(kept: &mut Vec<ImageBuffers>, gpu: &Gpu, size: (u32, u32), planes: u32) -> Result<(), GpuError> {
     let place = kept.iter().position(|images| images.size == size);
-    let images = place.map_or_else(|| ImageBuffers::new(gpu, size), |place| Ok(kept.remove(place)))?;
+    let images = place.map_or_else(|| ImageBuffers::new(gpu, size, planes), |place| Ok(kept.remove(place)))?;
     kept.insert(0, images);
     kept.truncate(SIZES_KEPT);
     Ok(())

@@ -2,12 +2,15 @@
 
 use crate::gpu::Kernel;
 use crate::render::{BlendForm, Rasterizer, shaders};
+use crate::splat::model::Surface;
 
 #[derive(Debug)]
 pub(super) struct Kernels {
     pub loss_forward: Kernel,
     pub loss_reduce: Kernel,
     pub loss_backward: Kernel,
+    /// Only of a planar surface.
+    pub surface_loss: Option<Kernel>,
     pub rasterize_backward: Kernel,
     pub sum_slots: Kernel,
     pub project_backward: Kernel,
@@ -18,11 +21,13 @@ impl Kernels {
     /// For the views that `rasterizer` renders: both passes of the blending take the same form.
     pub fn new(rasterizer: &Rasterizer) -> Self {
         let (gpu, form) = (rasterizer.gpu(), rasterizer.form());
-        let kernel = |source: &shaders::ShaderSource| Kernel::new(gpu, source.name, "main", &source.text(form));
+        let blending = rasterizer.blending();
+        let kernel = |source: &shaders::ShaderSource| Kernel::new(gpu, source.name, "main", &source.text(blending));
         Self {
             loss_forward: kernel(&shaders::LOSS_FORWARD),
             loss_reduce: kernel(&shaders::LOSS_REDUCE),
             loss_backward: kernel(&shaders::LOSS_BACKWARD),
+            surface_loss: (blending.surface == Surface::Planar).then(|| kernel(&shaders::SURFACE_LOSS)),
             rasterize_backward: kernel(match form {
                 BlendForm::Wide => &shaders::RASTERIZE_BACKWARD_WIDE,
                 BlendForm::Narrow => &shaders::RASTERIZE_BACKWARD_NARROW,

@@ -74,7 +74,7 @@ pub(super) struct Scores {
 impl Scores {
     pub fn new(rasterizer: &Rasterizer) -> Result<Self, GpuError> {
         let (gpu, form) = (rasterizer.gpu(), rasterizer.form());
-        let kernel = |source: &shaders::ShaderSource| Kernel::new(gpu, source.name, "main", &source.text(form));
+        let kernel = |source: &shaders::ShaderSource| Kernel::new(gpu, source.name, "main", &source.text(rasterizer.blending()));
         Ok(Self {
             rasterize: kernel(match form {
                 BlendForm::Wide => &shaders::RASTERIZE_SCORES_WIDE,

@@ -14,10 +14,10 @@ use super::image_buffers::{self, ImageBuffers};
 use super::kernels::Kernels;
 use super::scores::{ErrorPixels, GaussianScore, OverScores, ScoredImage, Scores};
 use super::survey::SurveyPass;
-use super::{AdamConfig, LossConfig, LossTerms, Pixels, TargetImage};
+use super::{AdamConfig, LossConfig, LossTerms, Pixels, PlanarConfig, TargetImage};
 use crate::gpu::{Gpu, GpuBuffer, GpuError};
 use crate::render::layout::{StepLog, View};
-use crate::render::{BlendForm, GpuCloud, Rasterizer, Rendered, ViewCounts};
+use crate::render::{BlendForm, Blending, GpuCloud, Rasterizer, Rendered, ViewCounts};
 use crate::splat::model::Dropout;
 use crate::splat::{Exposure, ViewCamera};
 
@@ -76,6 +76,8 @@ enum Sink<'a> {
 pub struct Trainer {
     pub(super) rasterizer: Rasterizer,
     kernels: Kernels,
+    /// Of a planar surface.
+    planar: PlanarConfig,
     scores: Scores,
     pub(super) survey: SurveyPass,
     /// Steps submitted so far, and the host's time to encode and submit them.
@@ -103,15 +105,15 @@ impl Trainer {
     /// [`GpuError`] if a shader does not compile or a buffer does not fit.
     pub fn new(gpu: Arc<Gpu>) -> Result<Self, GpuError> {
         let form = BlendForm::of(&gpu);
-        Self::with_form(gpu, form)
+        Self::with_blending(gpu, form)
     }
 
-    /// A trainer with the given form of the blending passes.
+    /// A trainer with the given blending passes.
     ///
     /// # Errors
     /// [`GpuError`] if a shader does not compile or a buffer does not fit.
-    pub fn with_form(gpu: Arc<Gpu>, form: BlendForm) -> Result<Self, GpuError> {
-        let rasterizer = Rasterizer::with_form(gpu, form)?;
+    pub fn with_blending(gpu: Arc<Gpu>, blending: impl Into<Blending>) -> Result<Self, GpuError> {
+        let rasterizer = Rasterizer::with_blending(gpu, blending)?;
         let gpu = rasterizer.gpu();
         let kernels = Kernels::new(&rasterizer);
         gpu.check()?;
@@ -119,6 +121,7 @@ impl Trainer {
         let logs = (0..STEPS_AT_ONCE).map(|i| log.window((i * LOG_STRIDE) as u64, LOG_STRIDE as u64)).collect();
         Ok(Self {
             kernels,
+            planar: PlanarConfig::default(),
             scores: Scores::new(&rasterizer)?,
             survey: SurveyPass::new(gpu)?,
             steps: 0,
@@ -128,6 +131,11 @@ impl Trainer {
             logs,
             rasterizer,
         })
+    }
+
+    /// With these weights of a planar surface.
+    pub fn with_planar(self, planar: PlanarConfig) -> Self {
+        Self { planar, ..self }
     }
 
     /// For each view in turn: renders the map, compares it with the target, and moves the Gaussians that were blended by one step of
@@ -277,6 +285,12 @@ impl Trainer {
         self.encode_time
     }
 
+    /// Puts the buffers for a size of view in front.
+    fn choose_images(&mut self, size: (u32, u32)) -> Result<(), GpuError> {
+        let planes = 1 + self.rasterizer.blending().image_planes();
+        image_buffers::choose(&mut self.images, self.rasterizer.gpu(), size, planes)
+    }
+
     /// Encodes one whole step.
     fn encode(
         &mut self,
@@ -293,7 +307,7 @@ impl Trainer {
         };
         let view = View::new(viewpoint.camera, viewpoint.background).with_dropout(dropout);
         let prepared = self.rasterizer.prepare_view(cloud, view)?;
-        image_buffers::choose(&mut self.images, &gpu, (prepared.view.width, prepared.view.height))?;
+        self.choose_images((prepared.view.width, prepared.view.height))?;
         match objective {
             Objective::Image { view, loss, log } => {
                 if let (None, Some(pixels)) = (&view.target.pixels, view.streamed) {
@@ -302,7 +316,7 @@ impl Trainer {
                 let cells = self.put_uniforms(view, loss, &prepared);
                 self.rasterizer.encode_forward(pass, cloud.parameters(), &prepared);
                 let target = self.images[0].pixels(view.target);
-                self.encode_loss(pass, &prepared, target, cells.loss, &self.logs[*log]);
+                self.encode_loss(pass, &prepared, target, &cells, &self.logs[*log]);
                 if let Some(setup) = cells.scores {
                     let image = ScoredImage { gradients: &self.images[0].gradients, log: &self.logs[*log] };
                     self.scores.encode(pass, &self.rasterizer, &prepared, &image, setup);

@@ -115,14 +115,6 @@ impl BlendForm {
         }
     }
 
-    /// Bytes of the forward pass' checkpoints for so many intersections: colour, depth and transmittance of a tile's pixels each.
-    pub(crate) fn checkpoint_bytes(self, intersections: usize) -> u64 {
-        match self {
-            Self::Wide => (intersections as u64 / u64::from(BUCKET) + 1) * u64::from(TILE_WIDTH * TILE_HEIGHT) * 20,
-            Self::Narrow => 0,
-        }
-    }
-
     /// Tiles that a workgroup of a blending pass takes.
     fn group_tiles(self) -> u32 {
         match self {
@@ -140,9 +132,64 @@ impl BlendForm {
     }
 }
 
+/// What the blending passes are compiled for.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Blending {
+    /// How a tile's pixels are spread over invocations.
+    pub form: BlendForm,
+    /// Where along a ray a Gaussian lies.
+    pub surface: Surface,
+}
+
+impl From<BlendForm> for Blending {
+    fn from(form: BlendForm) -> Self {
+        Self { form, ..Self::default() }
+    }
+}
+
+impl Blending {
+    /// All forms of all surfaces.
+    pub fn all() -> impl Iterator<Item = Self> {
+        [Surface::Volume, Surface::Planar].into_iter().flat_map(|surface| BlendForm::ALL.map(|form| Self { form, surface }))
+    }
+
+    /// Vectors of a projected Gaussian.
+    pub(crate) fn projected(self) -> u32 {
+        match self.surface {
+            Surface::Volume => 3,
+            Surface::Planar => 4,
+        }
+    }
+
+    /// Vectors of a rendered pixel.
+    pub(crate) fn image_planes(self) -> u32 {
+        self.projected() - 2
+    }
+
+    /// Vectors of four pixels' state in a checkpoint.
+    fn checkpoint(self) -> u32 {
+        match self.surface {
+            Surface::Volume => 5,
+            Surface::Planar => 8,
+        }
+    }
+
+    /// Bytes of the forward pass' checkpoints for so many intersections: what a tile's pixels have blended.
+    pub(crate) fn checkpoint_bytes(self, intersections: usize) -> u64 {
+        let pixels = u64::from(TILE_WIDTH * TILE_HEIGHT);
+        match self.form {
+            BlendForm::Wide => (intersections as u64 / u64::from(BUCKET) + 1) * pixels * 4 * u64::from(self.checkpoint()),
+            BlendForm::Narrow => 0,
+        }
+    }
+}
+
 /// The constants above as WGSL, put before every shader.
-pub fn wgsl_constants(form: BlendForm) -> String {
+pub fn wgsl_constants(blending: Blending) -> String {
+    let form = blending.form;
     let floats = [
+        ("LEAST_SCALE", LEAST_SCALE),
+        ("MOST_SLANT", MOST_SLANT),
         ("ALPHA_MIN", ALPHA_MIN),
         ("ALPHA_MAX", ALPHA_MAX),
         ("TRANSMITTANCE_MIN", TRANSMITTANCE_MIN),
@@ -160,6 +207,9 @@ pub fn wgsl_constants(form: BlendForm) -> String {
         ("TILE_WIDTH", TILE_WIDTH),
         ("TILE_HEIGHT", TILE_HEIGHT),
         ("STRIPS", form.strips()),
+        ("PROJECTED", blending.projected()),
+        ("IMAGE_PLANES", blending.image_planes()),
+        ("CHECKPOINT", blending.checkpoint()),
         ("GROUP_TILES", form.group_tiles()),
         ("LIST_PARTS", LIST_PARTS),
         ("SORT_BLOCK", SORT_BLOCK),

@@ -9,7 +9,7 @@ mod sort;
 mod workspace;
 
 pub use cloud::{CloudState, GaussianHistory, GpuCloud, RunMotion};
-pub use layout::BlendForm;
+pub use layout::{BlendForm, Blending};
 pub use plan::{Division, Plan};
 pub use rasterizer::{PreparedView, Rasterizer, Rendered, ViewCounts};
 pub use shaders::{SHADERS, ShaderSource};

@@ -6,11 +6,14 @@
 use std::sync::Arc;
 
 use super::cloud::GpuCloud;
-use super::layout::{BlendForm, COUNTERS, Counter, INTERSECTION_COUNTER, ScanSetup, TileListsSetup, VISIBLE_COUNTER, View};
+use super::layout::{
+    BlendForm, Blending, COUNTERS, Counter, INTERSECTION_COUNTER, ScanSetup, TileListsSetup, VISIBLE_COUNTER, View,
+};
 use super::shaders;
 use super::sort::{Sort, SortJob};
 use super::workspace::{Capacities, Workspace};
 use crate::gpu::{Gpu, GpuBuffer, GpuError, IndirectSize, Kernel, UniformCell, Uniforms, workgroups};
+use crate::splat::model::Surface;
 use crate::splat::{Exposure, ViewCamera};
 
 /// See [`depth_key`](crate::splat::model::depth_key).
@@ -30,6 +33,9 @@ pub struct Rendered {
     pub color_depth: Vec<[f32; 4]>,
     /// `[H, W]` share of light that reaches what lies behind the map; alpha is one minus it.
     pub transmittance: Vec<f32>,
+    /// `[H, W]` of a planar surface: slopes of the depth along x and y and its square, blended, and the depth behind which less than half of the
+    /// light is left; metres and pixels. Empty otherwise.
+    pub surface: Vec<[f32; 4]>,
 }
 
 impl Rendered {
@@ -47,6 +53,11 @@ impl Rendered {
     /// Expected depth of what was blended at pixel `i`, metres; 0 where nothing was.
     pub fn expected_depth(&self, i: usize) -> f32 {
         if self.alpha(i) > 0.0 { self.color_depth[i][3] / self.alpha(i) } else { 0.0 }
+    }
+
+    /// Depth behind which less than half of the light is left at pixel `i`, metres; 0 where more than that passes. Only of a planar surface.
+    pub fn median_depth(&self, i: usize) -> f32 {
+        if self.transmittance[i] < 0.5 { self.surface[i][3] } else { 0.0 }
     }
 }
 
@@ -75,7 +86,7 @@ struct Kernels {
 #[derive(Debug)]
 pub struct Rasterizer {
     gpu: Arc<Gpu>,
-    form: BlendForm,
+    blending: Blending,
     kernels: Kernels,
     /// Views of more intersections are refused.
     most_intersections: usize,
@@ -106,15 +117,26 @@ impl Rasterizer {
     /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn new(gpu: Arc<Gpu>) -> Result<Self, GpuError> {
         let form = BlendForm::of(&gpu);
-        Self::with_form(gpu, form)
+        Self::with_blending(gpu, form)
     }
 
-    /// With a given form of the blending passes.
+    /// Of this surface, with the form of the blending passes that suits the adapter.
     ///
     /// # Errors
     /// [`GpuError`] if a buffer does not fit or the device fails.
-    pub fn with_form(gpu: Arc<Gpu>, form: BlendForm) -> Result<Self, GpuError> {
-        let kernel = |source: &shaders::ShaderSource| Kernel::new(&gpu, source.name, "main", &source.text(form));
+    pub fn of_surface(gpu: Arc<Gpu>, surface: Surface) -> Result<Self, GpuError> {
+        let form = BlendForm::of(&gpu);
+        Self::with_blending(gpu, Blending { form, surface })
+    }
+
+    /// With given blending passes.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
+    pub fn with_blending(gpu: Arc<Gpu>, blending: impl Into<Blending>) -> Result<Self, GpuError> {
+        let blending = blending.into();
+        let form = blending.form;
+        let kernel = |source: &shaders::ShaderSource| Kernel::new(&gpu, source.name, "main", &source.text(blending));
         let kernels = Kernels {
             project_forward: kernel(&shaders::PROJECT_FORWARD),
             compact_visible: kernel(&shaders::COMPACT_VISIBLE),
@@ -131,7 +153,7 @@ impl Rasterizer {
         gpu.check()?;
         let scan = |label: &str, counter| GpuBuffer::uniform(&gpu, label, &ScanSetup { counter, pad: [0; 3] });
         Ok(Self {
-            form,
+            blending,
             kernels,
             most_intersections: usize::MAX,
             count_mode: GpuBuffer::uniform(&gpu, "count mode", &TileListsSetup { emit: 0, pad: [0; 3] })?,
@@ -139,7 +161,7 @@ impl Rasterizer {
             visible_scan: scan("visible scan", VISIBLE_COUNTER)?,
             intersection_scan: scan("intersection scan", INTERSECTION_COUNTER)?,
             uniforms: Uniforms::new(&gpu)?,
-            workspace: Workspace::new(&gpu, form)?,
+            workspace: Workspace::new(&gpu, blending)?,
             gpu,
         })
     }
@@ -161,7 +183,12 @@ impl Rasterizer {
 
     /// The form of the blending passes.
     pub fn form(&self) -> BlendForm {
-        self.form
+        self.blending.form
+    }
+
+    /// What the blending passes are compiled for.
+    pub fn blending(&self) -> Blending {
+        self.blending
     }
 
     /// Capacities of the scratch buffers.
@@ -231,12 +258,12 @@ impl Rasterizer {
         bindings: &[(u32, &GpuBuffer)],
     ) {
         let bindings: Vec<_> = self.lists(prepared).into_iter().chain(bindings.iter().copied()).collect();
-        match self.form {
+        match self.form() {
             BlendForm::Wide => {
                 let offset = Counter::per_bucket_offset(INTERSECTION_COUNTER);
                 kernel.dispatch_indirect(&self.gpu, pass, &bindings, IndirectSize { buffer: &self.workspace.counters, offset });
             }
-            BlendForm::Narrow => kernel.dispatch(&self.gpu, pass, &bindings, self.form.workgroups(prepared.view.tiles())),
+            BlendForm::Narrow => kernel.dispatch(&self.gpu, pass, &bindings, self.form().workgroups(prepared.view.tiles())),
         }
     }
 
@@ -261,7 +288,7 @@ impl Rasterizer {
         let by_depth = SortJob { keys: &ws.depth_keys, values: &ws.order, counter: VISIBLE_COUNTER, bits: DEPTH_KEY_BITS };
         k.sort.encode(gpu, pass, ws, &by_depth);
         self.encode_tiles(pass, prepared);
-        k.rasterize_forward.dispatch(gpu, pass, &self.lists(prepared), self.form.workgroups(view.tiles()));
+        k.rasterize_forward.dispatch(gpu, pass, &self.lists(prepared), self.form().workgroups(view.tiles()));
     }
 
     fn encode_scan(&self, pass: &mut wgpu::ComputePass<'_>, prepared: &PreparedView, setup: &GpuBuffer) {
@@ -297,7 +324,7 @@ impl Rasterizer {
         debug_assert_eq!(sorted, prepared.sorted);
         let ranges = [(0, view), (1, &ws.counters), (2, &ws.tile_keys[sorted]), (3, &ws.ranges)];
         k.tile_ranges.dispatch(gpu, pass, &ranges, workgroups(tiles.div_ceil(256)));
-        if self.form == BlendForm::Narrow {
+        if self.form() == BlendForm::Narrow {
             k.order_tiles.dispatch(gpu, pass, &[(0, view), (1, &ws.ranges)], [1, 1, 1]);
         }
     }
@@ -350,14 +377,15 @@ impl Rasterizer {
             self.encode_forward(&mut encoder.begin_compute_pass(&Default::default()), cloud.averages(), &prepared);
             self.uniforms.upload(&self.gpu);
             let (ws, pixels) = (&self.workspace, prepared.view.pixels() as usize);
+            let planes = pixels * self.blending.image_planes() as usize;
             let parts = [
                 ws.counters.part::<Counter>(0, COUNTERS as usize),
-                ws.color_depth.part::<[f32; 4]>(0, pixels),
+                ws.color_depth.part::<[f32; 4]>(0, planes),
                 ws.state.part::<[u32; 2]>(0, pixels),
             ];
             let read = self.gpu.read(Some(encoder), &parts)?;
             let counters: Vec<Counter> = read.part(0);
-            let (color_depth, state) = (read.part(1), read.part::<[u32; 2]>(2));
+            let (mut color_depth, state) = (read.part::<[f32; 4]>(1), read.part::<[u32; 2]>(2));
             drop(read);
             if self.counts(&counters).is_none() {
                 self.reserve_for(&counters)?;
@@ -366,6 +394,7 @@ impl Rasterizer {
             return Ok(Rendered {
                 width: prepared.view.width,
                 height: prepared.view.height,
+                surface: color_depth.split_off(pixels),
                 color_depth,
                 transmittance: state.iter().map(|s| f32::from_bits(s[0])).collect(),
             });

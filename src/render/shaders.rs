@@ -1,6 +1,7 @@
 //! Every shader, composed of the constants, the shared parts it names, and its own file.
 
-use super::layout::{self, BlendForm};
+use super::layout::{self, Blending};
+use crate::splat::model::Surface;
 
 /// A composed shader, named as its stage.
 pub struct ShaderSource {
@@ -12,11 +13,28 @@ pub struct ShaderSource {
 }
 
 impl ShaderSource {
-    /// The whole WGSL text; only the blending passes depend on the form.
-    pub fn text(&self, form: BlendForm) -> String {
-        let constants = layout::wgsl_constants(form);
-        std::iter::once(constants.as_str()).chain(self.parts.iter().copied()).collect::<Vec<_>>().join("\n")
+    /// The whole WGSL text; only the projection and the blending passes depend on the blending.
+    pub fn text(&self, blending: impl Into<Blending>) -> String {
+        let blending = blending.into();
+        let constants = layout::wgsl_constants(blending);
+        let parts = std::iter::once(constants.as_str()).chain(self.parts.iter().copied());
+        parts.map(|part| of_surface(part, blending.surface)).collect::<Vec<_>>().join("\n")
     }
+}
+
+/// Without the lines between `//# planar` and `//# end`, unless the surface is planar.
+fn of_surface(text: &str, surface: Surface) -> String {
+    let mut is_kept = true;
+    let mut kept = String::with_capacity(text.len());
+    for line in text.split_inclusive('\n') {
+        match line.trim() {
+            "//# planar" => is_kept = surface == Surface::Planar,
+            "//# end" => is_kept = true,
+            _ if is_kept => kept.push_str(line),
+            _ => {}
+        }
+    }
+    kept
 }
 
 const VIEW: &str = include_str!("../../shaders/shared/view.wgsl");
@@ -59,6 +77,7 @@ shaders! {
     RASTERIZE_FORWARD = "rasterize_forward", "rasterize_forward", [VIEW, TILE], ["main"];
     LOSS_FORWARD = "loss_forward", "loss_forward", [PIXEL_WINDOW, TARGET], ["main"];
     LOSS_BACKWARD = "loss_backward", "loss_backward", [PIXEL_WINDOW, TARGET], ["main"];
+    SURFACE_LOSS = "surface_loss", "surface_loss", [VIEW], ["main"];
     LOSS_REDUCE = "loss_reduce", "loss_reduce", [COUNTERS], ["main"];
     RASTERIZE_BACKWARD_NARROW = "rasterize_backward_narrow", "rasterize_backward_narrow", [VIEW, TILE, TILE_BACKWARD], ["main"];
     RASTERIZE_BACKWARD_WIDE = "rasterize_backward_wide", "rasterize_backward_wide", [VIEW, TILE, TILE_BACKWARD, TILE_STREAM], ["main"];

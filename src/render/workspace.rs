@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::layout::{BlendForm, COUNTERS, Counter, SORT_BLOCK, SORT_CHUNK};
+use super::layout::{Blending, COUNTERS, Counter, SORT_BLOCK, SORT_CHUNK};
 use crate::gpu::{Gpu, GpuBuffer, GpuError};
 
 /// Bytes of one intersection's gradient: three vec4.
@@ -11,7 +11,7 @@ const INTERSECTION_GRADIENT_BYTES: u64 = 48;
 /// Scratch that one rendered view leaves behind for its backward pass. Sizes only grow.
 #[derive(Debug)]
 pub(crate) struct Workspace {
-    form: BlendForm,
+    blending: Blending,
     pub(crate) counters: GpuBuffer,
     // Per Gaussian.
     pub(crate) capacity: usize,
@@ -50,11 +50,11 @@ pub struct Capacities {
 }
 
 impl Workspace {
-    pub(super) fn new(gpu: &Gpu, form: BlendForm) -> Result<Self, GpuError> {
+    pub(super) fn new(gpu: &Gpu, blending: Blending) -> Result<Self, GpuError> {
         let (capacity, intersection_capacity) = (16_384, 131_072);
         let empty = |label: &str| GpuBuffer::storage(gpu, label, 16);
         let mut workspace = Self {
-            form,
+            blending,
             counters: GpuBuffer::storage(gpu, "counters", u64::from(COUNTERS) * std::mem::size_of::<Counter>() as u64)?,
             capacity: 0,
             projected: empty("projected")?,
@@ -96,7 +96,7 @@ impl Workspace {
             return Ok(());
         }
         let words = |label: &str| GpuBuffer::storage(gpu, label, capacity as u64 * 4);
-        self.projected = GpuBuffer::storage(gpu, "projected", capacity as u64 * 48)?;
+        self.projected = GpuBuffer::storage(gpu, "projected", capacity as u64 * u64::from(self.blending.projected()) * 16)?;
         self.visible = words("visible")?;
         self.block_sums = GpuBuffer::storage(gpu, "block sums", (capacity as u64).div_ceil(256) * 4)?;
         self.depth_keys = [words("depth keys")?, words("depth keys")?];
@@ -147,6 +147,7 @@ impl Workspace {
     }
 
     fn rendered(&self, gpu: &Gpu, pixels: u32, intersections: usize) -> Result<GpuBuffer, GpuError> {
-        GpuBuffer::storage(gpu, "rendered", u64::from(pixels) * 16 + self.form.checkpoint_bytes(intersections))
+        let bytes = u64::from(pixels) * u64::from(self.blending.image_planes()) * 16;
+        GpuBuffer::storage(gpu, "rendered", bytes + self.blending.checkpoint_bytes(intersections))
     }
 }

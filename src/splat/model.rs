@@ -50,6 +50,22 @@ pub struct Dropout {
     pub seed: u32,
 }
 
+/// Where along a ray a Gaussian lies.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Surface {
+    /// At the depth of its centre.
+    #[default]
+    Volume,
+    /// Where the ray meets its plane: the normal is that of its level set (RaDe-GS), its thinnest axis where it is flat.
+    Planar,
+}
+
+/// Standard deviation below which an axis counts as this thin beside the others, metres.
+pub const LEAST_SCALE: f64 = 1e-15;
+/// Most that depth changes along a plane, in units of what the ray moves sideways: beyond, the plane is seen edge on.
+pub const MOST_SLANT: f64 = 4.0;
+
 /// A camera to render from.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ViewCamera {

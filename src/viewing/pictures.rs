@@ -209,6 +209,7 @@ mod tests {
         let pixels = 32u32 * 20;
         let pixel = |i: u32| [color[0], color[1], color[2], metres(i)];
         Rendered {
+            surface: Vec::new(),
             width: 32,
             height: 20,
             color_depth: (0..pixels).map(pixel).collect(),

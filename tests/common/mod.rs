@@ -63,6 +63,7 @@ pub fn image_gradient(rng: &mut Rng, pixels: usize) -> ImageGradient64 {
         color: (0..pixels).map(|_| Vector3::new(number(), number(), number())).collect(),
         depth: (0..pixels).map(|_| number()).collect(),
         alpha: (0..pixels).map(|_| number()).collect(),
+        surface: (0..pixels).map(|_| Vector3::new(number(), number(), number())).collect(),
     }
 }
 
@@ -73,6 +74,7 @@ pub fn linear_loss(image: &Image64, gradient: &ImageGradient64) -> f64 {
             image.color[i].dot(&gradient.color[i])
                 + image.depth[i] * gradient.depth[i]
                 + (1.0 - image.transmittance[i]) * gradient.alpha[i]
+                + image.surface[i].dot(&gradient.surface[i])
         })
         .sum()
 }

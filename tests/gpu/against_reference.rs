@@ -2,85 +2,17 @@
 //! software one will do); says so loudly and passes where there is none.
 
 use crate::common::requirements::adapter;
+use crate::oracle::*;
 use fastrand::Rng;
-use image::RgbImage;
-use keysplat::geometry::Pinhole;
-use keysplat::gpu::Gpu;
-use keysplat::optimise::{AdamConfig, ImageGradients, LossConfig, TargetImage, Trainer, TrainingView, ssim_phase};
-use keysplat::render::{BlendForm, GpuCloud, Rasterizer};
-use keysplat::splat::model::Dropout;
-use keysplat::splat::{Exposure, GaussianCloud, ShDegree, ViewCamera, opacity_from_raw, raw_opacity_from_opacity};
+use keysplat::optimise::{AdamConfig, LossConfig, Trainer, TrainingView, ssim_phase};
+use keysplat::render::{GpuCloud, Rasterizer};
+use keysplat::splat::model::{Dropout, Surface};
+use keysplat::splat::{Exposure, GaussianCloud, ShDegree, opacity_from_raw, raw_opacity_from_opacity};
 use keysplat::verification::reference::adam::{Adam64, Decay64};
-use keysplat::verification::reference::loss::{LossWeights, Target64, loss};
+use keysplat::verification::reference::loss::{LossWeights, loss};
 use keysplat::verification::reference::project_backward::backward;
-use keysplat::verification::reference::smoothing::{smooth, smooth_backward};
-use keysplat::verification::reference::{Cutoffs, Gaussian64, Image64, ImageGradient64, View64, cloud64, rasterize_forward};
+use keysplat::verification::reference::{Gaussian64, View64, cloud64, rasterize_forward};
 use nalgebra::Vector3;
-use std::sync::Arc;
-
-/// Relative error by norm that the project promises for images and for gradients.
-const IMAGE_TOLERANCE: f64 = 1e-4;
-const GRADIENT_TOLERANCE: f64 = 1e-3;
-const BACKGROUND: [f32; 3] = [0.2, 0.5, 0.1];
-
-fn view64(camera: &ViewCamera, cloud: &GaussianCloud) -> View64 {
-    let background = Vector3::from(BACKGROUND).map(f64::from);
-    View64 { camera: *camera, background, cutoffs: Cutoffs::Sharp, antialiased: cloud.antialiased }
-}
-
-pub fn upload(gpu: &Gpu, cloud: &GaussianCloud) -> GpuCloud {
-    let on_gpu = GpuCloud::of(gpu, cloud).unwrap();
-    assert_eq!(on_gpu.len(), cloud.len());
-    on_gpu
-}
-
-fn flat(cloud: &[Gaussian64]) -> Vec<f64> {
-    cloud.iter().flat_map(Gaussian64::flat).collect()
-}
-
-/// A rasterizer of each form of the blending passes, with its trainer.
-fn both_forms(gpu: &Arc<Gpu>) -> impl Iterator<Item = Trainer> {
-    BlendForm::ALL.into_iter().map(|form| Trainer::with_form(gpu.clone(), form).unwrap())
-}
-
-/// Renders on both and compares the images; returns the oracle's.
-fn compare_images(gpu: &Arc<Gpu>, cloud: &GaussianCloud, camera: &ViewCamera) -> Image64 {
-    let expected = rasterize_forward::render(&view64(camera, cloud), &cloud64(cloud));
-    let colors = expected.color.iter().zip(&expected.depth).flat_map(|(c, d)| [c.x, c.y, c.z, *d]);
-    let wanted: Vec<f64> = colors.chain(expected.transmittance.iter().copied()).collect();
-    for mut trainer in both_forms(gpu) {
-        let rendered = trainer.render(&upload(gpu, cloud), camera, BACKGROUND).unwrap();
-        let got: Vec<f64> = rendered.color_depth.iter().flatten().chain(&rendered.transmittance).map(|v| f64::from(*v)).collect();
-        let error = crate::common::relative_error(&got, &wanted);
-        assert!(error < IMAGE_TOLERANCE, "image, {:?}: {error:e}", trainer.form());
-    }
-    expected
-}
-
-fn image_gradients(by_image: &ImageGradient64) -> ImageGradients {
-    let color_depth =
-        by_image.color.iter().zip(&by_image.depth).map(|(c, d)| [c.x as f32, c.y as f32, c.z as f32, *d as f32]).collect();
-    ImageGradients { color_depth, alpha: by_image.alpha.iter().map(|a| *a as f32).collect() }
-}
-
-/// Pushes the same image gradient back on both and compares.
-fn compare_gradients(gpu: &Arc<Gpu>, cloud: &GaussianCloud, camera: &ViewCamera, rng: &mut Rng) {
-    let pixels = (camera.pinhole.width * camera.pinhole.height) as usize;
-    let by_image = crate::common::image_gradient(rng, pixels);
-    let by = image_gradients(&by_image);
-    let expected = backward(&view64(camera, cloud), &cloud64(cloud), &by_image);
-    let wanted = flat(&expected);
-    for mut trainer in both_forms(gpu) {
-        let form = trainer.form();
-        let got = trainer.gradients_from_image(&upload(gpu, cloud), camera, BACKGROUND, &by).unwrap();
-        let got_flat = flat(&cloud64(&got.cloud));
-        assert!(got_flat.iter().all(|v| v.is_finite()), "a gradient is not finite");
-        let error = crate::common::relative_error(&got_flat, &wanted);
-        assert!(error < GRADIENT_TOLERANCE, "gradient, {form:?}: {error:e}");
-        let dots = got_flat.iter().zip(&wanted).fold((0.0, 0.0, 0.0), |s, (x, y)| (s.0 + x * y, s.1 + x * x, s.2 + y * y));
-        assert!(dots.0 / (dots.1 * dots.2).sqrt() > 1.0 - 1e-6, "gradient's direction, {form:?}");
-    }
-}
 
 #[test]
 fn random_scenes_agree() {
@@ -89,98 +21,13 @@ fn random_scenes_agree() {
         let mut rng = Rng::with_seed(seed);
         let camera = crate::common::camera(&mut rng, 61, 45);
         let mut cloud = crate::common::scene(&mut rng, 300, ShDegree::ALL[(seed % 4) as usize]);
-        compare_images(&gpu, &cloud, &camera);
-        compare_gradients(&gpu, &cloud, &camera, &mut rng);
+        compare(&gpu, &cloud, &camera, &mut rng);
         cloud.antialiased = true;
         // Of a pixel's size, and needles: what the compensation is for.
         (0..cloud.len()).for_each(|i| cloud.log_scales[i] -= glam::Vec3::new((i % 3) as f32, (i % 2) as f32, 1.0));
-        compare_images(&gpu, &cloud, &camera);
-        compare_gradients(&gpu, &cloud, &camera, &mut rng);
+        compare(&gpu, &cloud, &camera, &mut rng);
     }
 }
-
-/// The sampling interval of the nearest view that moved a Gaussian smooths it, in what is rendered, learned and downloaded.
-#[test]
-fn smoothing_by_sampling_intervals_agrees() {
-    let Some(gpu) = adapter() else { return };
-    for degree in [ShDegree::ALL[0], ShDegree::ALL[2]] {
-        let mut rng = Rng::with_seed(30);
-        let camera = crate::common::camera(&mut rng, 61, 45);
-        let mut cloud = crate::common::scene(&mut rng, 300, degree);
-        cloud.antialiased = true;
-        (0..cloud.len()).for_each(|i| cloud.log_scales[i] -= glam::Vec3::new((i % 3) as f32, (i % 2) as f32, 1.0));
-        let (image, wide) = target(&mut rng, camera.pinhole);
-        let image = upload_target(&gpu, &image, &wide);
-        let mut nearer = camera;
-        nearer.camera_from_world.translation.vector.z -= 0.3;
-        let still = AdamConfig { max_elongation: 1e6, ..AdamConfig::default().scaled(0.0, 0.0) };
-        for mut trainer in both_forms(&gpu) {
-            let on_gpu = upload(&gpu, &cloud);
-            let learn = |trainer: &mut Trainer, camera: &ViewCamera| {
-                let views = [TrainingView::new(*camera, &image)];
-                trainer.steps(&on_gpu, &views, &LossConfig::default(), &still).unwrap();
-                on_gpu.sampling_intervals(&gpu).unwrap()
-            };
-            let depth = |camera: &ViewCamera, i: usize| {
-                let mean = nalgebra::Point3::from(cloud.means[i].to_array().map(f64::from));
-                (camera.camera_from_world * mean).z / camera.pinhole.fx.max(camera.pinhole.fy)
-            };
-            let first = learn(&mut trainer, &camera);
-            let is_of =
-                |camera: &ViewCamera, i: usize, interval: f32| (f64::from(interval) / depth(camera, i) - 1.0).abs() < 1e-4;
-            assert!((0..cloud.len()).all(|i| first[i] == 0.0 || is_of(&camera, i, first[i])));
-            assert!(first.iter().filter(|interval| **interval > 0.0).count() > cloud.len() / 2);
-            let second = learn(&mut trainer, &nearer);
-            assert!((0..cloud.len()).all(|i| second[i] == first[i] || is_of(&nearer, i, second[i])));
-            assert!((0..cloud.len()).all(|i| first[i] == 0.0 || second[i] <= first[i]) && second != first);
-            let intervals = learn(&mut trainer, &camera);
-            assert_eq!(intervals, second, "a view from further away changes nothing");
-
-            let gaussians = cloud64(&cloud);
-            let pairs = || gaussians.iter().zip(intervals.iter().map(|interval| f64::from(*interval)));
-            let smoothed: Vec<Gaussian64> = pairs().map(|(g, interval)| smooth(g, interval)).collect();
-            let downloaded = on_gpu.download(&gpu).unwrap();
-            let error = crate::common::relative_error(&flat(&cloud64(&downloaded)), &flat(&smoothed));
-            assert!(downloaded.antialiased && error < 1e-6, "download: {error:e}");
-            compare_images(&gpu, &downloaded, &camera);
-            let rendered = trainer.render(&on_gpu, &camera, BACKGROUND).unwrap();
-            let baked = trainer.render(&upload(&gpu, &downloaded), &camera, BACKGROUND).unwrap();
-            let row = |rendered: &[[f32; 4]]| rendered.iter().flatten().map(|v| f64::from(*v)).collect::<Vec<f64>>();
-            assert!(crate::common::relative_error(&row(&rendered.color_depth), &row(&baked.color_depth)) < IMAGE_TOLERANCE);
-
-            let by_image = crate::common::image_gradient(&mut rng, 61 * 45);
-            let by = image_gradients(&by_image);
-            let by_smoothed = backward(&view64(&camera, &cloud), &smoothed, &by_image);
-            let wanted: Vec<Gaussian64> =
-                pairs().zip(&by_smoothed).map(|((g, interval), by)| smooth_backward(g, interval, by)).collect();
-            let got = trainer.gradients_from_image(&on_gpu, &camera, BACKGROUND, &by).unwrap();
-            let error = crate::common::relative_error(&flat(&cloud64(&got.cloud)), &flat(&wanted));
-            assert!(error < GRADIENT_TOLERANCE, "gradient, {:?}: {error:e}", trainer.form());
-        }
-    }
-}
-
-/// A target image for the loss, 8-bit like a real one, whose left border and some other pixels the camera did not record.
-fn target(rng: &mut Rng, pinhole: Pinhole) -> (RgbImage, Target64) {
-    let (width, height) = (pinhole.width, pinhole.height);
-    let color = RgbImage::from_fn(width, height, |_, _| image::Rgb([rng.u8(..), rng.u8(..), rng.u8(..)]));
-    let metres: Vec<f32> =
-        (0..width * height).map(|i| if i % 4 == 0 { 0.0 } else { crate::common::between(rng, 0.5, 3.0) }).collect();
-    let wide = Target64 {
-        width: width as usize,
-        height: height as usize,
-        color: color.pixels().map(|p| Vector3::from(p.0).map(|v| f64::from(v) / 255.0)).collect(),
-        depth: metres.iter().map(|m| f64::from(*m)).collect(),
-        valid: (0..width * height).map(|i| i % width > 4 && i % 13 != 0).collect(),
-    };
-    (color, wide)
-}
-
-fn upload_target(gpu: &Gpu, image: &RgbImage, wide: &Target64) -> TargetImage {
-    let metres: Vec<f32> = wide.depth.iter().map(|m| *m as f32).collect();
-    TargetImage::masked(gpu, image, Some(&metres), Some(&wide.valid)).unwrap()
-}
-
 #[test]
 fn the_loss_and_its_whole_gradient_agree() {
     let Some(gpu) = adapter() else { return };
@@ -199,7 +46,7 @@ fn the_loss_and_its_whole_gradient_agree() {
         let views = vec![TrainingView::new(camera, &image); steps];
         trainer.steps(&on_gpu, &views, &config, &still).unwrap();
         let got = trainer.gradients(&on_gpu, &camera, &image, &config).unwrap();
-        let view = View64 { background: Vector3::zeros(), ..view64(&camera, &cloud) };
+        let view = View64 { background: Vector3::zeros(), ..view64(&camera, &cloud, Surface::Volume) };
         let rendered = rasterize_forward::render(&view, &cloud64(&cloud));
         let weights = LossWeights {
             ssim: f64::from(config.ssim_weight),
@@ -293,12 +140,10 @@ fn hazards_stay_finite_and_right() {
         let mut cloud = crate::common::scene(&mut rng, 40, ShDegree::default());
         spoil(&mut cloud, 7);
         eprintln!("hazard: {name}");
-        let expected = compare_images(&gpu, &cloud, &camera);
+        let expected = compare(&gpu, &cloud, &camera, &mut rng);
         assert!(expected.transmittance.iter().any(|t| *t < 0.9), "the scene was not seen");
-        compare_gradients(&gpu, &cloud, &camera, &mut rng);
         cloud.antialiased = true;
-        compare_images(&gpu, &cloud, &camera);
-        compare_gradients(&gpu, &cloud, &camera, &mut rng);
+        compare(&gpu, &cloud, &camera, &mut rng);
     }
 }
 

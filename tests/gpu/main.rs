@@ -4,6 +4,7 @@
 mod common;
 
 mod against_reference;
+mod antialiasing;
 mod density;
 mod embedding;
 mod failures;
@@ -11,10 +12,12 @@ mod long_optimisation;
 mod loop_moves_map;
 mod mapper;
 mod motion;
+mod oracle;
 mod properties;
 mod reference_gradients;
 mod scores;
 mod shaders;
 mod stress;
+mod surfaces;
 mod survey;
 mod traffic;

@@ -34,7 +34,7 @@ fn machine() -> Option<&'static Mutex<Machine>> {
     static MACHINE: OnceLock<Result<Mutex<Machine>, String>> = OnceLock::new();
     let machine = MACHINE.get_or_init(|| match Gpu::open(None) {
         Ok(gpu) => {
-            let form = |&form| Trainer::with_form(gpu.clone(), form).unwrap();
+            let form = |&form| Trainer::with_blending(gpu.clone(), form).unwrap();
             let forms = BlendForm::ALL.iter().map(form).collect();
             Ok(Mutex::new(Machine { gpu, forms }))
         }
@@ -77,7 +77,16 @@ fn scene(seed: u64, faults: &[(u8, f32)]) -> (View64, GaussianCloud) {
         spoil(&mut gaussian, *fault, *strength);
         cloud.push(gaussian);
     }
-    (View64 { camera, background: Vector3::new(0.1, 0.2, 0.3), cutoffs: Cutoffs::Sharp, antialiased: false }, cloud)
+    (
+        View64 {
+            camera,
+            background: Vector3::new(0.1, 0.2, 0.3),
+            cutoffs: Cutoffs::Sharp,
+            antialiased: false,
+            surface: Default::default(),
+        },
+        cloud,
+    )
 }
 
 fn narrow(v: &Vector3<f64>) -> [f32; 3] {
@@ -121,7 +130,7 @@ fn check(seed: u64, faults: &[(u8, f32)]) -> Result<(), TestCaseError> {
         })
         .collect();
     let alpha = by_image.alpha.iter().map(|a| *a as f32).collect();
-    let by = ImageGradients { color_depth, alpha };
+    let by = ImageGradients { color_depth, alpha, surface: Vec::new() };
     let got = trainer.gradients_from_image(&on_gpu, &view.camera, background, &by).unwrap();
     let flat: Vec<f64> = cloud64(&got.cloud).iter().flat_map(Gaussian64::flat).collect();
     prop_assert!(flat.iter().all(|v| v.is_finite()), "a gradient is not finite");

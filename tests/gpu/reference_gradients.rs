@@ -3,10 +3,12 @@
 
 use fastrand::Rng;
 use keysplat::splat::ShDegree;
+use keysplat::splat::model::Surface;
 use keysplat::verification::reference::loss::{LossWeights, Target64, loss};
 use keysplat::verification::reference::project_backward::backward;
 use keysplat::verification::reference::rasterize_forward::render;
 use keysplat::verification::reference::smoothing::{smooth, smooth_backward};
+use keysplat::verification::reference::surface::{self, SurfaceWeights};
 use keysplat::verification::reference::{Cutoffs, Gaussian64, Image64, View64, cloud64};
 use nalgebra::Vector3;
 
@@ -29,6 +31,7 @@ fn view(rng: &mut Rng) -> View64 {
         background: Vector3::new(0.2, 0.5, 0.1),
         cutoffs: Cutoffs::Smooth,
         antialiased: false,
+        surface: Surface::Volume,
     }
 }
 
@@ -66,6 +69,8 @@ fn parameter_gradients_are_central_differences() {
 
         let antialiased = View64 { antialiased: true, ..view };
         check(&cloud, &backward(&antialiased, &cloud, &by_image), &|cloud| loss(&antialiased, cloud));
+        let planar = View64 { surface: Surface::Planar, ..view };
+        check(&cloud, &backward(&planar, &cloud, &by_image), &|cloud| loss(&planar, cloud));
         let interval = |i: usize| 0.02 * i as f64;
         let smoothed = |cloud: &[Gaussian64]| cloud.iter().enumerate().map(|(i, g)| smooth(g, interval(i))).collect::<Vec<_>>();
         let by_smoothed = backward(&antialiased, &smoothed(&cloud), &by_image);
@@ -116,6 +121,7 @@ fn loss_gradient_is_a_central_difference() {
         color: (0..width * height).map(|_| Vector3::new(number(), number(), number())).collect(),
         depth: (0..width * height).map(|_| 2.0 * number()).collect(),
         transmittance: (0..width * height).map(|_| 0.4 * number()).collect(),
+        ..Image64::default()
     };
     let weights = LossWeights { ssim: 0.2, depth: 0.3, precise_depth: 1.5, phase: [1, 0] };
     let (_, gradient) = loss(&image, &target, &weights);
@@ -133,5 +139,44 @@ fn loss_gradient_is_a_central_difference() {
         assert!((gradient.depth[i] - numeric).abs() < 1e-8, "depth {i}");
         let numeric = (value(&|m| m.transmittance[i] -= STEP) - value(&|m| m.transmittance[i] += STEP)) / (2.0 * STEP);
         assert!((gradient.alpha[i] - numeric).abs() < 1e-8, "alpha {i}");
+    }
+}
+
+/// The loss of a planar surface, with an edge, an opening and a slope of its own.
+#[test]
+fn surface_loss_gradient_is_a_central_difference() {
+    let mut rng = Rng::with_seed(5);
+    let pinhole = crate::common::camera(&mut rng, 15, 12).pinhole;
+    let pixels = 15 * 12;
+    let mut number = || rng.f64();
+    let mut image = Image64::default();
+    for i in 0..pixels {
+        let (transmittance, depth) = (if i % 31 == 0 { 0.9 } else { 0.3 * number() }, if i % 15 < 6 { 1.0 } else { 1.3 });
+        let sum = (1.0 - transmittance) * (depth + 0.01 * number());
+        image.transmittance.push(transmittance);
+        image.depth.push(sum);
+        let slopes = Vector3::new(number() - 0.5, number() - 0.5, 0.0) * 0.02;
+        image.surface.push(slopes + Vector3::new(0.0, 0.0, sum * sum / (1.0 - transmittance) * (1.0 + 0.1 * number())));
+    }
+    let weights = SurfaceWeights { normal: 2.0, spread: 3.0, min_alpha: 0.5, edge: 0.05 };
+    let (value, gradient) = surface::loss(&pinhole, &image, &weights);
+    let moved = |change: &dyn Fn(&mut Image64, f64)| {
+        let at = |by: f64| {
+            let mut moved = image.clone();
+            change(&mut moved, by);
+            surface::loss(&pinhole, &moved, &weights).0
+        };
+        (at(STEP) - at(-STEP)) / (2.0 * STEP)
+    };
+    assert!(value > 0.1 && gradient.surface.iter().filter(|by| by.x != 0.0).count() > pixels / 3, "most pixels have a normal");
+    for i in 0..pixels {
+        for c in 0..3 {
+            let numeric = moved(&|m, by| m.surface[i][c] += by);
+            assert!((gradient.surface[i][c] - numeric).abs() < 1e-7, "surface {i}, {c}: {} {numeric}", gradient.surface[i][c]);
+        }
+        let numeric = moved(&|m, by| m.depth[i] += by);
+        assert!((gradient.depth[i] - numeric).abs() < 1e-7, "depth {i}: {} {numeric}", gradient.depth[i]);
+        let numeric = moved(&|m, by| m.transmittance[i] -= by);
+        assert!((gradient.alpha[i] - numeric).abs() < 1e-7, "alpha {i}: {} {numeric}", gradient.alpha[i]);
     }
 }

@@ -25,7 +25,13 @@ fn scores_are_those_of_their_definition() {
         let (width, height) = (camera.pinhole.width, camera.pinhole.height);
         let image = RgbImage::from_fn(width, height, |_, _| Rgb([rng.u8(..), rng.u8(..), rng.u8(..)]));
 
-        let view = View64 { camera, background: Vector3::zeros(), cutoffs: Cutoffs::Sharp, antialiased: false };
+        let view = View64 {
+            camera,
+            background: Vector3::zeros(),
+            cutoffs: Cutoffs::Sharp,
+            antialiased: false,
+            surface: Default::default(),
+        };
         let cloud_64 = cloud64(&cloud);
         let rendered = rasterize_forward::render(&view, &cloud_64);
         let color: Vec<Vector3<f64>> = image.pixels().map(|p| Vector3::from(p.0.map(|c| f64::from(c) / 255.0))).collect();
@@ -40,7 +46,7 @@ fn scores_are_those_of_their_definition() {
         let (total, by_image) = loss(&rendered, &target, &weights);
         let expected = scores(&view, &cloud_64, &by_image, &wrong);
 
-        let mut trainer = Trainer::with_form(gpu.clone(), form).unwrap();
+        let mut trainer = Trainer::with_blending(gpu.clone(), form).unwrap();
         let mut on_gpu = GpuCloud::new(&gpu, cloud.sh_degree, cloud.len()).unwrap();
         on_gpu.append(&gpu, &cloud).unwrap();
         let target = TargetImage::new(&gpu, &image, None).unwrap();

@@ -6,8 +6,8 @@ use keysplat::optimise::{SurveyRules, TargetImage, Trainer};
 use keysplat::render::BlendForm;
 use keysplat::splat::ShDegree;
 
-use crate::against_reference::upload;
 use crate::common::requirements::adapter;
+use crate::oracle::upload;
 
 /// Odd sizes: cells at the border are cut off.
 const SIZE: (u32, u32) = (203, 101);
@@ -23,7 +23,7 @@ fn cells_and_samples_are_those_of_the_render() {
     let image = RgbImage::from_pixel(SIZE.0, SIZE.1, Rgb([90; 3]));
     let target = TargetImage::new(&gpu, &image, Some(&depth)).unwrap();
     for (form, cell) in BlendForm::ALL.into_iter().flat_map(|form| [1, 2, 4].map(|cell| (form, cell))) {
-        let mut trainer = Trainer::with_form(gpu.clone(), form).unwrap();
+        let mut trainer = Trainer::with_blending(gpu.clone(), form).unwrap();
         let rendered = trainer.render(&cloud, &camera, [0.0; 3]).unwrap();
         let rules = SurveyRules { target: &target, cell, min_alpha: 0.5, depth_disagreement: 0.1 };
         let survey = trainer.survey(&cloud, &camera, Some(&rules)).unwrap();

@@ -10,9 +10,9 @@ use keysplat::optimise::{AdamConfig, LossConfig, TargetImage, Trainer, TrainingV
 use keysplat::render::BlendForm;
 use keysplat::splat::ShDegree;
 
-use crate::against_reference::upload;
 use crate::common::requirements::adapter;
 use crate::mapper::keyframe;
+use crate::oracle::upload;
 
 const STEPS: usize = 10;
 
@@ -33,7 +33,7 @@ fn steps_are_one_submission_with_one_upload_and_one_wait() {
     let target = TargetImage::new(&gpu, &RgbImage::from_pixel(320, 240, image::Rgb([90, 120, 30])), None).unwrap();
     let views = [TrainingView::new(camera, &target); STEPS];
     for form in BlendForm::ALL {
-        let mut trainer = Trainer::with_form(gpu.clone(), form).unwrap();
+        let mut trainer = Trainer::with_blending(gpu.clone(), form).unwrap();
         let (traffic, _) = of(&gpu, || trainer.steps(&on_gpu, &views, &LossConfig::default(), &AdamConfig::default()).unwrap());
         // The narrow form orders the tiles, the wide form sums the slots.
         let dispatches = 26;

@@ -7,11 +7,14 @@ use crate::optimise::image_buffers::LOSS_TILE;
 use crate::optimise::loss::{GpuPixels, ssim_phase};
 use crate::render::layout::{Counter, INTERSECTION_COUNTER, LossSetup, VISIBLE_COUNTER};
 use crate::render::{GpuCloud, PreparedView};
+use crate::splat::model::Surface;
 
 /// Uniforms of a step beside its view.
 pub(super) struct StepUniforms {
     pub loss: UniformCell,
     pub scores: Option<UniformCell>,
+    /// Of a planar surface.
+    pub surface: Option<UniformCell>,
 }
 
 impl Trainer {
@@ -36,8 +39,10 @@ impl Trainer {
             green_gain,
             blue_gain,
         };
+        let is_planar = self.rasterizer.blending().surface == Surface::Planar;
         let uniforms = &mut self.rasterizer.uniforms;
         StepUniforms {
+            surface: is_planar.then(|| uniforms.put(&self.planar.setup(prepared.view.pixels()))),
             loss: uniforms.put(&setup),
             scores: view.scored.map(|pixels| uniforms.put(&pixels.setup(loss, prepared.view.pixels()))),
         }
@@ -48,14 +53,14 @@ impl Trainer {
         pass: &mut wgpu::ComputePass<'_>,
         prepared: &PreparedView,
         target: &GpuPixels,
-        setup: UniformCell,
+        cells: &StepUniforms,
         log: &GpuBuffer,
     ) {
         let (gpu, ws, k) = (self.rasterizer.gpu(), &self.rasterizer.workspace, &self.kernels);
         let (width, height) = (prepared.view.width, prepared.view.height);
         let size = [width.div_ceil(LOSS_TILE), height.div_ceil(LOSS_TILE), 1];
         let inputs = [
-            (0, self.rasterizer.uniforms.of(setup)),
+            (0, self.rasterizer.uniforms.of(cells.loss)),
             (1, &ws.color_depth),
             (2, &ws.state),
             (3, &target.color),
@@ -67,6 +72,16 @@ impl Trainer {
         k.loss_forward.dispatch(gpu, pass, &with((6, loss_sums)), size);
         k.loss_reduce.dispatch(gpu, pass, &[(0, loss_sums), (1, &ws.counters), (2, log)], [1, 1, 1]);
         k.loss_backward.dispatch(gpu, pass, &with((6, &self.images[0].gradients)), size);
+        if let Some((kernel, cell)) = k.surface_loss.as_ref().zip(cells.surface) {
+            let inputs = [
+                (0, self.rasterizer.view(prepared)),
+                (1, self.rasterizer.uniforms.of(cell)),
+                (2, &ws.color_depth),
+                (3, &ws.state),
+                (4, &self.images[0].gradients),
+            ];
+            kernel.dispatch(gpu, pass, &inputs, size);
+        }
     }
 
     pub(super) fn encode_backward(
@@ -76,8 +91,10 @@ impl Trainer {
         prepared: &PreparedView,
         sink: &Sink<'_>,
     ) {
+        let is_planar = self.rasterizer.blending().surface == Surface::Planar;
+        let thickness = is_planar.then_some(self.planar.thickness);
         let adam = match sink {
-            Sink::Adam(adam) => Some(self.rasterizer.uniforms.put(&adam.setup(self.steps))),
+            Sink::Adam(adam) => Some(self.rasterizer.uniforms.put(&adam.setup(self.steps, thickness))),
             Sink::Gradient(_) => None,
         };
         let (gpu, ws, k) = (self.rasterizer.gpu(), &self.rasterizer.workspace, &self.kernels);

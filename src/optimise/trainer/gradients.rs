@@ -3,8 +3,9 @@
 use super::{Objective, Sink, Trainer, TrainingView, Viewpoint};
 use crate::geometry::Pinhole;
 use crate::gpu::{GpuBuffer, GpuError};
-use crate::optimise::{LossConfig, LossTerms, TargetImage, image_buffers};
+use crate::optimise::{LossConfig, LossTerms, TargetImage};
 use crate::render::GpuCloud;
+use crate::splat::model::Surface;
 use crate::splat::{GaussianCloud, ViewCamera};
 
 /// Gradient of a loss by the map.
@@ -23,6 +24,8 @@ pub struct ImageGradients {
     pub color_depth: Vec<[f32; 4]>,
     /// `[H, W]` by alpha.
     pub alpha: Vec<f32>,
+    /// `[H, W]` by a planar surface's slopes and squared depth, see [`Rendered::surface`](crate::render::Rendered::surface); empty otherwise.
+    pub surface: Vec<[f32; 4]>,
 }
 
 impl Trainer {
@@ -58,10 +61,13 @@ impl Trainer {
     ) -> Result<Gradients, GpuError> {
         let gpu = self.rasterizer.gpu().clone();
         let Pinhole { width, height, .. } = camera.pinhole;
-        image_buffers::choose(&mut self.images, &gpu, (width, height))?;
+        self.choose_images((width, height))?;
         self.images[0].gradients.write(&gpu, 0, &by_image.color_depth);
         let alpha: Vec<[f32; 4]> = by_image.alpha.iter().map(|a| [*a, 0.0, 0.0, 0.0]).collect();
         self.images[0].gradients.write(&gpu, by_image.color_depth.len(), &alpha);
+        if self.rasterizer.blending().surface == Surface::Planar {
+            self.images[0].gradients.write(&gpu, 2 * by_image.color_depth.len(), &by_image.surface);
+        }
         self.collect(cloud, camera, background, &Objective::Given)
     }
 

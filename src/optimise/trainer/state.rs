@@ -5,7 +5,6 @@ use serde::{Deserialize, Serialize};
 
 use super::Trainer;
 use crate::gpu::GpuError;
-use crate::optimise::image_buffers;
 use crate::render::Capacities;
 
 /// Number of steps and buffer capacities of a [`Trainer`].
@@ -50,7 +49,7 @@ impl Trainer {
         self.rasterizer.reserve(state.rasterizer)?;
         self.steps = state.steps;
         for size in state.sizes.iter().rev() {
-            image_buffers::choose(&mut self.images, gpu, *size)?;
+            self.choose_images(*size)?;
         }
         self.survey.reserve(gpu, state.surveyed)?;
         if state.scored > 0 { self.scores.reserve(gpu, state.scored) } else { Ok(()) }

@@ -236,6 +236,17 @@ host_twins! {
         /// Factor from the recorded blue to the map's.
         blue_gain: f32,
     }
+    /// Loss of a planar surface (`shaders/surface_loss.wgsl`).
+    SurfaceSetup {
+        /// Weight of the normals' term over the number of pixels.
+        normal_weight: f32,
+        /// Weight of the spread's term over the number of pixels.
+        spread_weight: f32,
+        /// Alpha below which a pixel has no surface.
+        min_alpha: f32,
+        /// Share of the depth from which two pixels lie on different surfaces.
+        edge: f32,
+    }
     /// High-error mask (`shaders/shared/tile_scores.wgsl`).
     ScoreSetup {
         /// Factor of the mean absolute error above which a pixel is a high-error one.
@@ -265,11 +276,13 @@ host_twins! {
         step_harmonics: u32,
         /// Logarithm of the largest ratio of a Gaussian's longest axis to its second.
         log_elongation: f32,
+        /// Logarithm of the ratio of its shortest axis to its second to which the shortest shrinks.
+        log_thickness: f32,
         /// The colour's learning rate is divided by √(1 + this · steps of the Gaussian).
         color_settling: f32,
         /// Least share of the newest parameters in their average.
         least_share: f32,
         /// Unused.
-        pad: [f32; 3],
+        pad: [f32; 2],
     }
 }

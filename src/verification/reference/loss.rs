@@ -68,8 +68,7 @@ pub fn loss(image: &Image64, target: &Target64, weights: &LossWeights) -> (f64, 
     let pixels = target.width * target.height;
     let per_pixel = 1.0 / pixels as f64;
     let mut value = 0.0;
-    let mut gradient =
-        ImageGradient64 { color: vec![Vector3::zeros(); pixels], depth: vec![0.0; pixels], alpha: vec![0.0; pixels] };
+    let mut gradient = ImageGradient64::zero(pixels);
     for channel in 0..3 {
         // Pixels that were not recorded are zero in both images, as those beyond the border are.
         let recorded = |colors: &[Vector3<f64>]| -> Vec<f64> {

@@ -11,9 +11,11 @@ pub mod rasterize_forward;
 pub mod scores;
 pub mod smoothing;
 pub mod spherical_harmonics;
+pub mod surface;
 
 use nalgebra::{Vector2, Vector3, Vector4};
 
+use crate::splat::model::Surface;
 use crate::splat::{GaussianCloud, ShDegree, ViewCamera};
 
 /// One Gaussian's raw parameters; also its gradient, which has the same shape.
@@ -101,10 +103,12 @@ pub struct View64 {
     pub cutoffs: Cutoffs,
     /// Whether the map is antialiased.
     pub antialiased: bool,
+    /// Where along a ray a Gaussian lies.
+    pub surface: Surface,
 }
 
 /// A rendered image, `[H * W]` each.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Image64 {
     /// Linear RGB.
     pub color: Vec<Vector3<f64>>,
@@ -112,6 +116,10 @@ pub struct Image64 {
     pub depth: Vec<f64>,
     /// Share of the background, in [0, 1].
     pub transmittance: Vec<f64>,
+    /// Of a planar surface, Σ w of the slopes along x and y and of z²; metres, pixels. Zero otherwise.
+    pub surface: Vec<Vector3<f64>>,
+    /// Depth behind which less than half of the light is left, metres; 0 where more than that passes.
+    pub median_depth: Vec<f64>,
 }
 
 /// Gradient of a loss by the rendered image.
@@ -123,6 +131,27 @@ pub struct ImageGradient64 {
     pub depth: Vec<f64>,
     /// By alpha = 1 - transmittance.
     pub alpha: Vec<f64>,
+    /// By a planar surface's slopes and z².
+    pub surface: Vec<Vector3<f64>>,
+}
+
+impl ImageGradient64 {
+    /// None, of so many pixels.
+    pub fn zero(pixels: usize) -> Self {
+        let (color, surface) = (vec![Vector3::zeros(); pixels], vec![Vector3::zeros(); pixels]);
+        Self { color, depth: vec![0.0; pixels], alpha: vec![0.0; pixels], surface }
+    }
+
+    /// The sum of two losses' gradients.
+    pub fn plus(mut self, other: &Self) -> Self {
+        let add = |to: &mut [Vector3<f64>], from: &[Vector3<f64>]| to.iter_mut().zip(from).for_each(|(a, b)| *a += b);
+        let add_scalars = |to: &mut [f64], from: &[f64]| to.iter_mut().zip(from).for_each(|(a, b)| *a += b);
+        add(&mut self.color, &other.color);
+        add(&mut self.surface, &other.surface);
+        add_scalars(&mut self.depth, &other.depth);
+        add_scalars(&mut self.alpha, &other.alpha);
+        self
+    }
 }
 
 /// Gradient of a loss by what the projection made of one Gaussian.
@@ -138,4 +167,6 @@ pub struct ProjectedGradient {
     pub color: Vector3<f64>,
     /// By the depth along z.
     pub depth: f64,
+    /// By the slope of the depth.
+    pub slope: Vector2<f64>,
 }

@@ -31,7 +31,14 @@ fn project_backward(view: &View64, g: &Gaussian64, f: &Projected64, by: &Project
     let by_jacobian = by_t * f.axes.transpose();
     let by_axes: Matrix3<f64> = f.jacobian.transpose() * by_t;
 
-    let by_point = by_point(view, f, by, &by_jacobian);
+    let mut by_point = by_point(view, f, by, &by_jacobian);
+    let mut by_axes = by_axes;
+    if let Some(plane) = &f.plane {
+        let by_slope = by.slope.component_div(&Vector2::new(view.camera.pinhole.fx, view.camera.pinhole.fy));
+        let by_plane = plane.backward(by_slope * f.depth);
+        by_point += by_plane.mean + Vector3::new(0.0, 0.0, by_slope.dot(&plane.slant));
+        by_axes += by_plane.axes;
+    }
     let free = by.color.zip_map(&f.unclamped_color, |b, c| if c > 0.0 { b } else { 0.0 });
     let by_direction: Vector3<f64> =
         g.sh.iter().enumerate().map(|(k, c)| spherical_harmonics::basis_gradient(k, &f.direction) * c.dot(&free)).sum();

@@ -2,8 +2,9 @@
 
 use nalgebra::{Matrix2, Matrix2x3, Matrix3, Vector2, Vector3, Vector4};
 
+use super::surface::Plane64;
 use super::{Cutoffs, Gaussian64, View64, spherical_harmonics};
-use crate::splat::model;
+use crate::splat::model::{self, Surface};
 
 /// A projected Gaussian, with the intermediate values of the backward pass.
 #[derive(Clone, Debug)]
@@ -33,6 +34,17 @@ pub struct Projected64 {
     pub(super) direction: Vector3<f64>,
     pub(super) distance: f64,
     pub(super) unclamped_color: Vector3<f64>,
+    /// Of a planar surface.
+    pub(super) plane: Option<Plane64>,
+    /// Change of its depth along x and y of the image, metres a pixel; zero unless the surface is planar.
+    pub slope: Vector2<f64>,
+}
+
+impl Projected64 {
+    /// Its depth at `offset` pixels from the mean, metres.
+    pub(super) fn depth_at(&self, offset: &Vector2<f64>) -> f64 {
+        self.depth + self.slope.dot(offset)
+    }
 }
 
 pub(super) fn rotation_matrix(q: &Vector4<f64>) -> Matrix3<f64> {
@@ -89,7 +101,10 @@ pub fn project(view: &View64, g: &Gaussian64) -> Option<Projected64> {
     let direction = offset.normalize();
     let harmonics = g.sh.iter().enumerate().map(|(k, c)| c * spherical_harmonics::basis(k, &direction));
     let unclamped_color = Vector3::repeat(0.5) + harmonics.sum::<Vector3<f64>>();
+    let plane = (view.surface == Surface::Planar).then(|| Plane64::new(&axes, p_in_camera));
     Some(Projected64 {
+        slope: plane.as_ref().map_or_else(Vector2::zeros, |plane| plane.slant.component_div(&Vector2::new(p.fx, p.fy)) * z),
+        plane,
         mean: Vector2::new(p.fx * tangent.x + p.cx, p.fy * tangent.y + p.cy),
         depth: z,
         conic: covariance.try_inverse()?,

@@ -4,7 +4,7 @@ use nalgebra::{Vector2, Vector3};
 
 use super::project_forward::{Projected64, project};
 use super::{Cutoffs, Gaussian64, Image64, View64};
-use crate::splat::model;
+use crate::splat::model::{self, Surface};
 
 /// The projected Gaussians with their indices, nearest first; ties keep the order of the map.
 pub fn sorted(view: &View64, cloud: &[Gaussian64]) -> Vec<(usize, Projected64)> {
@@ -103,15 +103,20 @@ pub fn pixel_conditioning(view: &View64, cloud: &[Gaussian64], slack: f64) -> Ve
 pub fn render(view: &View64, cloud: &[Gaussian64]) -> Image64 {
     let sorted = sorted(view, cloud);
     let p = &view.camera.pinhole;
-    let mut image = Image64 { color: Vec::new(), depth: Vec::new(), transmittance: Vec::new() };
+    let mut image = Image64::default();
     for (x, y) in (0..p.height).flat_map(|y| (0..p.width).map(move |x| (x, y))) {
         let (found, transmittance) = contributions(view, &sorted, x, y);
-        let weighted = |f: &dyn Fn(&Projected64) -> Vector3<f64>| -> Vector3<f64> {
-            found.iter().map(|c| f(&sorted[c.index].1) * (c.alpha * c.transmittance)).sum()
-        };
-        image.color.push(weighted(&|g| g.color) + view.background * transmittance);
-        image.depth.push(weighted(&|g| Vector3::new(g.depth, 0.0, 0.0)).x);
+        let colors = found.iter().map(|c| sorted[c.index].1.color * (c.alpha * c.transmittance));
+        image.color.push(colors.sum::<Vector3<f64>>() + view.background * transmittance);
+        image.depth.push(found.iter().map(|c| sorted[c.index].1.depth_at(&c.offset) * (c.alpha * c.transmittance)).sum());
         image.transmittance.push(transmittance);
+        let surface = |c: &Contribution| {
+            let (g, weight) = (&sorted[c.index].1, c.alpha * c.transmittance);
+            Vector3::new(g.slope.x, g.slope.y, g.depth_at(&c.offset).powi(2)) * weight
+        };
+        image.surface.push(if view.surface == Surface::Planar { found.iter().map(surface).sum() } else { Vector3::zeros() });
+        let half = found.iter().rev().find(|c| c.transmittance > 0.5).filter(|_| transmittance < 0.5);
+        image.median_depth.push(half.map_or(0.0, |c| sorted[c.index].1.depth_at(&c.offset)));
     }
     image
 }

@@ -45,6 +45,7 @@ pub fn scores(view: &View64, cloud: &[Gaussian64], by_image: &ImageGradient64, w
             color: only(&by_image.color, pixel),
             depth: only(&by_image.depth, pixel),
             alpha: only(&by_image.alpha, pixel),
+            surface: only(&by_image.surface, pixel),
         };
         for ((i, _), gradient) in sorted.iter().zip(backward(view, &sorted, &alone)) {
             signed[*i] += gradient.mean;

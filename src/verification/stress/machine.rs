@@ -5,15 +5,16 @@ use std::sync::Arc;
 
 use crate::gpu::{Gpu, GpuError};
 use crate::optimise::Trainer;
-use crate::render::{BlendForm, GpuCloud};
+use crate::render::{BlendForm, Blending, GpuCloud};
 use crate::splat::GaussianCloud;
+use crate::splat::model::Surface;
 
-/// A trainer of each form of the blending passes.
+/// A trainer of all blending passes.
 #[derive(Debug)]
 pub struct Machine {
     /// The device under test.
     pub gpu: Arc<Gpu>,
-    forms: [RefCell<Trainer>; 2],
+    trainers: Vec<RefCell<Trainer>>,
 }
 
 impl Machine {
@@ -23,14 +24,20 @@ impl Machine {
     /// [`GpuError`] if there is none.
     pub fn open(adapter: Option<&str>) -> Result<Self, GpuError> {
         let gpu = Gpu::open(adapter)?;
-        let form = |form| -> Result<_, GpuError> { Ok(RefCell::new(Trainer::with_form(gpu.clone(), form)?)) };
-        let [first, second] = BlendForm::ALL;
-        Ok(Self { forms: [form(first)?, form(second)?], gpu })
+        let trainer = |blending| Ok(RefCell::new(Trainer::with_blending(gpu.clone(), blending)?));
+        Ok(Self { trainers: Blending::all().map(trainer).collect::<Result<_, GpuError>>()?, gpu })
     }
 
     /// Runs on one of the two forms.
     pub(super) fn with<T>(&self, form: usize, work: impl FnOnce(&mut Trainer) -> T) -> T {
-        work(&mut self.forms[form % 2].borrow_mut())
+        self.with_surface(form, Surface::Volume, work)
+    }
+
+    /// The same of a surface.
+    pub(super) fn with_surface<T>(&self, form: usize, surface: Surface, work: impl FnOnce(&mut Trainer) -> T) -> T {
+        let blending = Blending { form: BlendForm::ALL[form % 2], surface };
+        let place = Blending::all().position(|other| other == blending).expect("all of them are there");
+        work(&mut self.trainers[place].borrow_mut())
     }
 
     pub(super) fn upload(&self, cloud: &GaussianCloud) -> Result<GpuCloud, GpuError> {

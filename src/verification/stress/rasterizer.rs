@@ -14,6 +14,7 @@ use crate::gpu::GpuError;
 use crate::optimise::ImageGradients;
 use crate::render::Rendered;
 use crate::splat::GaussianCloud;
+use crate::splat::model::Surface;
 use crate::verification::reference::project_backward::backward;
 use crate::verification::reference::rasterize_forward::{self, Conditioning, pixel_conditioning};
 use crate::verification::reference::{Cutoffs, Gaussian64, Image64, ImageGradient64, View64, cloud64};
@@ -33,18 +34,20 @@ const GRADIENT_FLOOR: f64 = 1e-4;
 const SHIFTS: [f64; 4] = [0.0, 100.0, 1e3, 1e4];
 
 pub fn families(machine: &Machine) -> Vec<Family<'_>> {
-    let of_fault = |(fault, name)| {
+    let of_fault = |surface, (fault, name)| {
         let case = move |rng: &mut Rng| {
             let scene = Scene::random(rng, fault);
-            check(machine, rng, &scene, [IMAGE_LIMIT, GRADIENT_LIMIT])
+            check(machine, rng, &scene, surface)
         };
-        Family::new(Part::Rasterizer, format!("render: {name}"), 1, case)
+        let surface = if surface == Surface::Planar { ", planar" } else { "" };
+        Family::new(Part::Rasterizer, format!("render: {name}{surface}"), 1, case)
     };
     let of_shift = |metres: f64| {
         let case = move |rng: &mut Rng| shifted(machine, rng, metres);
         Family::new(Part::Rasterizer, format!("render: {metres:e} m from the origin"), 4, case)
     };
-    Fault::ALL.into_iter().map(of_fault).chain(SHIFTS.into_iter().map(of_shift)).collect()
+    let of_faults = |surface| Fault::ALL.into_iter().map(move |fault| of_fault(surface, fault));
+    of_faults(Surface::Volume).chain(of_faults(Surface::Planar)).chain(SHIFTS.into_iter().map(of_shift)).collect()
 }
 
 fn view64(scene: &Scene) -> View64 {
@@ -53,6 +56,7 @@ fn view64(scene: &Scene) -> View64 {
         background: Vector3::from(BACKGROUND).map(f64::from),
         cutoffs: Cutoffs::Sharp,
         antialiased: false,
+        surface: Surface::Volume,
     }
 }
 
@@ -74,7 +78,13 @@ fn compare_images(outcome: &mut Outcome, got: &Rendered, wanted: &Image64, trust
     outcome.measure("colour", error(pixels().flat_map(color), IMAGE_FLOOR), limit);
     outcome.measure("depth", error(pixels().map(depth), IMAGE_FLOOR), limit);
     outcome.measure("alpha", error(pixels().map(alpha), IMAGE_FLOOR), limit);
-    let finite = got.color_depth.iter().flatten().chain(&got.transmittance).all(|v| v.is_finite());
+    if !got.surface.is_empty() {
+        let part = |c: usize| pixels().map(move |i| (f64::from(got.surface[i][c]), wanted.surface[i][c]));
+        outcome.measure("slopes", error(part(0).chain(part(1)), IMAGE_FLOOR), limit);
+        outcome.measure("squared depth", error(part(2), IMAGE_FLOOR), limit);
+    }
+    let values = got.color_depth.iter().chain(&got.surface).flatten().chain(&got.transmittance);
+    let finite = values.into_iter().all(|v| v.is_finite());
     outcome.require(finite, || "the image is not finite".into());
 }
 
@@ -100,11 +110,13 @@ fn image_gradient(rng: &mut Rng, trusted: &[bool]) -> ImageGradient64 {
         color: trusted.iter().map(|t| Vector3::new(number(t), number(t), number(t))).collect(),
         depth: trusted.iter().map(&mut number).collect(),
         alpha: trusted.iter().map(&mut number).collect(),
+        surface: trusted.iter().map(|t| Vector3::new(number(t), number(t), number(t))).collect(),
     }
 }
 
-fn check(machine: &Machine, rng: &mut Rng, scene: &Scene, limits: [f64; 2]) -> Result<Outcome, GpuError> {
-    let (view, wide) = (view64(scene), cloud64(&scene.cloud));
+fn check(machine: &Machine, rng: &mut Rng, scene: &Scene, surface: Surface) -> Result<Outcome, GpuError> {
+    let (view, wide) = (View64 { surface, ..view64(scene) }, cloud64(&scene.cloud));
+    let limits = [IMAGE_LIMIT, GRADIENT_LIMIT];
     let is_trusted = |pixel: &Conditioning| pixel.near_cutoffs == 0 && pixel.exponent_error < UNCERTAIN;
     let trusted: Vec<bool> = pixel_conditioning(&view, &wide, BAND).iter().map(is_trusted).collect();
     compare(machine, rng, scene, &Expected { view: &view, gaussians: &wide, trusted: &trusted }, limits)
@@ -134,8 +146,9 @@ fn compare(
     let colors = by_image.color.iter().zip(&by_image.depth);
     let color_depth = colors.map(|(c, d)| [c.x as f32, c.y as f32, c.z as f32, *d as f32]).collect();
     let alpha = by_image.alpha.iter().map(|a| *a as f32).collect();
-    let by = ImageGradients { color_depth, alpha };
-    let (rendered, gradients) = machine.with(rng.usize(..2), |trainer| {
+    let surface = by_image.surface.iter().map(|s| [s.x as f32, s.y as f32, s.z as f32, 0.0]).collect();
+    let by = ImageGradients { color_depth, alpha, surface };
+    let (rendered, gradients) = machine.with_surface(rng.usize(..2), view.surface, |trainer| {
         let rendered = trainer.render(&on_gpu, &scene.camera, BACKGROUND)?;
         Ok::<_, GpuError>((rendered, trainer.gradients_from_image(&on_gpu, &scene.camera, BACKGROUND, &by)?))
     })?;
@@ -171,7 +184,7 @@ fn shifted(machine: &Machine, rng: &mut Rng, metres: f64) -> Result<Outcome, Gpu
 fn rendered_of(image: &Image64) -> Rendered {
     let color_depth = image.color.iter().zip(&image.depth).map(|(c, d)| [c.x as f32, c.y as f32, c.z as f32, *d as f32]);
     let transmittance = image.transmittance.iter().map(|t| *t as f32).collect();
-    Rendered { width: 0, height: 0, color_depth: color_depth.collect(), transmittance }
+    Rendered { width: 0, height: 0, color_depth: color_depth.collect(), transmittance, surface: Vec::new() }
 }
 
 fn rms(got: &Rendered, wanted: &Image64) -> f64 {
