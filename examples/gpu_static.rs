@@ -9,7 +9,8 @@ use std::ffi::{CStr, CString};
 use std::path::Path;
 
 use ash::{Device, Instance, khr, vk};
-use keysplat::render::{BlendForm, SHADERS};
+use keysplat::render::{BlendForm, Blending, SHADERS};
+use keysplat::splat::model::Surface;
 use naga::back::{hlsl, msl, spv};
 use naga::proc::{BoundsCheckPolicies, BoundsCheckPolicy};
 use naga::valid::{Capabilities, ModuleInfo, ValidationFlags, Validator};
@@ -33,10 +34,15 @@ fn main() -> Outcome<()> {
     let folder = Path::new(arguments.first().ok_or("usage: gpu_static <folder> [budget.toml]")?);
     std::fs::create_dir_all(folder)?;
     let mut wide = Vec::new();
-    for form in BlendForm::ALL {
+    for blending in Blending::all() {
         for shader in SHADERS {
-            let text = shader.text(form);
-            let label = format!("{form:?}-{}", shader.name).to_lowercase();
+            let is_planar = blending.surface == Surface::Planar;
+            if is_planar && !shader.depends_on_surface() {
+                continue;
+            }
+            let text = shader.text(blending);
+            let surface = if is_planar { "planar-" } else { "" };
+            let label = format!("{:?}-{surface}{}", blending.form, shader.name).to_lowercase();
             std::fs::write(folder.join(format!("{label}.wgsl")), &text)?;
             let module = naga::front::wgsl::parse_str(&text).map_err(|e| e.emit_to_string(&text))?;
             let info = Validator::new(ValidationFlags::all(), Capabilities::all()).validate(&module)?;
@@ -45,14 +51,14 @@ fn main() -> Outcome<()> {
                     folder.join(if shader.entry_points.len() == 1 { label.clone() } else { format!("{label}-{entry_point}") });
                 let words = translate(&module, &info, entry_point, &path)?;
                 // Software adapters alone run what is narrow.
-                if form == BlendForm::Wide && !label.ends_with("_narrow") {
+                if blending.form == BlendForm::Wide && !label.ends_with("_narrow") {
                     let label = path.file_name().unwrap_or_default().to_string_lossy().replace("wide-", "");
                     wide.push(Compiled { label, entry_point: (*entry_point).into(), words, bindings: bindings(&module) });
                 }
             }
         }
     }
-    println!("{} shaders in {} forms are in {}", SHADERS.len(), BlendForm::ALL.len(), folder.display());
+    println!("{} shaders in {} forms are in {}", SHADERS.len(), Blending::all().count(), folder.display());
     let Some(budget) = arguments.get(1) else { return Ok(()) };
     let budget: Budget = toml::from_str(&std::fs::read_to_string(budget)?)?;
     let family = std::env::var("RADV_FORCE_FAMILY").map_err(|_| "RADV_FORCE_FAMILY has to name the GPU")?;

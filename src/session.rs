@@ -10,7 +10,7 @@ use std::sync::Arc;
 
 pub use dataset::{DatasetCounts, DatasetOptions, DatasetViews, export_dataset};
 pub use evaluate::{EvaluateOptions, evaluate_folder};
-pub use mesh::{FusedMesh, MeshOptions, mesh_folder};
+pub use mesh::{FusedMesh, MapDepth, MeshOptions, mesh_folder};
 pub use mesh_errors::{MeshReport, MeshTruthOptions, evaluate_mesh};
 
 use crate::config::Config;

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use keysplat::mesh::{DepthSource, MeshConfig, MeshFormat};
-use keysplat::session::{MeshOptions, mesh_folder};
+use keysplat::session::{MapDepth, MeshOptions, mesh_folder};
 use miette::IntoDiagnostic;
 
 use super::run::parse_bytes;
@@ -22,6 +22,9 @@ pub struct MeshArgs {
     /// Depth that is fused. By default the sensor's, and the map's where there is none.
     #[arg(long, value_enum)]
     depth: Option<DepthSource>,
+    /// How the map's depth is blended. By default plane where the run has mapping.surface = "planar", else centre.
+    #[arg(long, value_enum)]
+    map_depth: Option<MapDepth>,
     /// Fuse every posed frame, not the keyframes alone.
     #[arg(long)]
     all_frames: bool,
@@ -72,8 +75,9 @@ impl MeshArgs {
             simplify: self.simplify,
             max_memory_bytes: self.max_memory,
         };
-        let (depth, all_frames, every, scale) = (self.depth, self.all_frames, self.every, self.scale);
-        MeshOptions { mesh, depth, all_frames, every, scale, sequence: self.sequence.clone(), adapter: self.adapter.clone() }
+        let Self { depth, map_depth, all_frames, every, scale, .. } = *self;
+        let (sequence, adapter) = (self.sequence.clone(), self.adapter.clone());
+        MeshOptions { mesh, depth, map_depth, all_frames, every, scale, sequence, adapter }
     }
 }
 

@@ -19,6 +19,7 @@ use crate::render::{GpuCloud, Rasterizer, Rendered};
 use crate::sequence::{RectifiedImage, Rectifier, Rectifiers, Sequence};
 use crate::splat::GaussianCloud;
 use crate::splat::ViewCamera;
+use crate::splat::model::Surface;
 
 /// MonoGS compares every 5th frame.
 const MONOGS_EVERY: usize = 5;
@@ -126,6 +127,8 @@ pub struct ViewSource<'a> {
     pub gpu: &'a Arc<Gpu>,
     /// The map.
     pub cloud: &'a GaussianCloud,
+    /// Whose depth is compared.
+    pub surface: Surface,
 }
 
 /// Compares all posed views with their renders. Frames that cannot be read or are masked wholly are left out. `on_held_out` receives each held-out view, `on_view`
@@ -139,9 +142,9 @@ pub fn evaluate_views(
     on_held_out: &mut dyn FnMut(ComparedView),
     on_view: &dyn Fn(usize),
 ) -> Result<ImageProtocols, GpuError> {
-    let ViewSource { sequence, map_scale, gpu, cloud } = source;
+    let ViewSource { sequence, map_scale, gpu, cloud, surface } = source;
     let mut rectifiers = Rectifiers::new(map_scale);
-    let mut rasterizer = Rasterizer::new(gpu.clone())?;
+    let mut rasterizer = Rasterizer::of_surface(gpu.clone(), surface)?;
     let on_gpu = GpuCloud::of(gpu, cloud)?;
     let mut means = ProtocolMeans::default();
     for (batch, poses) in selection.poses.chunks(BATCH).enumerate() {

@@ -13,6 +13,11 @@ pub struct ShaderSource {
 }
 
 impl ShaderSource {
+    /// Whether a planar surface has a text of its own.
+    pub fn depends_on_surface(&self) -> bool {
+        self.parts.iter().any(|part| OF_SURFACES.iter().any(|mark| part.contains(mark)))
+    }
+
     /// The whole WGSL text; only the projection and the blending passes depend on the blending.
     pub fn text(&self, blending: impl Into<Blending>) -> String {
         let blending = blending.into();
@@ -21,6 +26,9 @@ impl ShaderSource {
         parts.map(|part| of_surface(part, blending.surface)).collect::<Vec<_>>().join("\n")
     }
 }
+
+/// Marks of text that differs between surfaces.
+const OF_SURFACES: [&str; 4] = ["//# planar", "PROJECTED", "IMAGE_PLANES", "CHECKPOINT"];
 
 /// Without the lines between `//# planar` and `//# end`, unless the surface is planar.
 fn of_surface(text: &str, surface: Surface) -> String {

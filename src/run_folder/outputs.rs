@@ -260,7 +260,7 @@ pub fn evaluate(
         is_held_out: &is_held_out,
         exposures: &input.exposures,
     };
-    let source = ViewSource { sequence, map_scale: config.map_scale, gpu, cloud: input.cloud };
+    let source = ViewSource { sequence, map_scale: config.map_scale, gpu, cloud: input.cloud, surface: config.mapping.surface };
     let images = evaluate_views(source, &selection, &mut on_held_out, on_view)?;
     pictures.finish()?;
     write_records(&out.join(COMPARISON), &comparison)?;

@@ -16,6 +16,7 @@ use crate::run_folder::OutputError;
 use crate::run_folder::outputs;
 use crate::sequence::{RectifiedImage, Rectifiers, SequenceError};
 use crate::splat::ViewCamera;
+use crate::splat::model::Surface;
 
 /// The map's depth is taken where it covers so much of a pixel.
 const LEAST_ALPHA: f32 = 0.5;
@@ -29,6 +30,8 @@ pub struct MeshOptions {
     pub mesh: MeshConfig,
     /// Depth that is fused; by default the sensor's, and the map's where there is none.
     pub depth: Option<DepthSource>,
+    /// How the map's depth is blended; by default as the run's configuration has it.
+    pub map_depth: Option<MapDepth>,
     /// Every posed frame instead of the keyframes alone.
     pub all_frames: bool,
     /// Only every n-th of them; 0 and 1 take all.
@@ -39,6 +42,34 @@ pub struct MeshOptions {
     pub sequence: Option<PathBuf>,
     /// Part of an adapter's name.
     pub adapter: Option<String>,
+}
+
+/// How a map's depth is blended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub enum MapDepth {
+    /// Expected depth of the Gaussians' centres.
+    Centre,
+    /// Expected depth of the Gaussians' planes.
+    Plane,
+    /// Depth of the plane behind which less than half of the light is left.
+    Median,
+}
+
+impl MapDepth {
+    /// That of a run's maps.
+    fn of(config: Option<&Config>) -> Self {
+        match config.map(|config| config.mapping.surface) {
+            Some(Surface::Planar) => Self::Plane,
+            Some(Surface::Volume) | None => Self::Centre,
+        }
+    }
+
+    fn surface(self) -> Surface {
+        match self {
+            Self::Centre => Surface::Volume,
+            Self::Plane | Self::Median => Surface::Planar,
+        }
+    }
 }
 
 /// A run's mesh.
@@ -75,13 +106,16 @@ pub fn mesh_folder(
     }
     let poses = read_trajectory(&folder.join(file))?;
     let cloud = format.read(&map).map_err(OutputError::from)?;
-    let recording = open_recording(folder, options)?;
+    let config_file = folder.join(outputs::CONFIG);
+    let config = if config_file.is_file() { Some(Config::read(&config_file).map_err(RecordingError::from)?) } else { None };
+    let recording = open_recording(config.as_ref(), options)?;
     let sensor = recording.as_ref().map(|recording| Measured::new(recording, folder, options)).transpose()?;
     let pinhole = sensor.as_ref().map_or_else(Pinhole::assumed, |sensor| sensor.pinhole);
     let frames = frame_of_pose(recording.as_ref(), &poses);
     let gpu = Gpu::open(options.adapter.as_deref())?;
     let on_gpu = GpuCloud::of(&gpu, &cloud)?;
-    let mut rasterizer = Rasterizer::new(gpu)?;
+    let map_depth = options.map_depth.unwrap_or_else(|| MapDepth::of(config.as_ref()));
+    let mut rasterizer = Rasterizer::of_surface(gpu, map_depth.surface())?;
     let stamped: Vec<_> = poses.poses.iter().step_by(options.every.max(1)).collect();
     if stamped.is_empty() {
         return Err(missing(file, "it holds no pose; map the recording again"));
@@ -98,7 +132,7 @@ pub fn mesh_folder(
         let rendered = rasterizer.render(&on_gpu, &camera, [0.0; 3])?;
         let frame = frames.get(&pose.timestamp_s.to_bits());
         let image = sensor.as_mut().zip(frame).and_then(|(sensor, frame)| sensor.image(*frame));
-        let depth = join(&rendered, image.as_ref(), options.depth);
+        let depth = join(&rendered, image.as_ref(), options.depth, map_depth);
         measured += usize::from(image.is_some_and(|image| image.depth.is_some()));
         views.push(view(pinhole, pose.world_from_camera, &rendered, &depth));
     }
@@ -110,9 +144,8 @@ pub fn mesh_folder(
 }
 
 /// The recording that a folder or the options name. One that the folder names may have gone: the map's depth needs none.
-fn open_recording(folder: &Path, options: &MeshOptions) -> Result<Option<Recording>, SessionError> {
-    let file = folder.join(outputs::CONFIG);
-    let config = if file.is_file() { Some(Config::read(&file).map_err(RecordingError::from)?) } else { None };
+fn open_recording(config: Option<&Config>, options: &MeshOptions) -> Result<Option<Recording>, SessionError> {
+    let config = config.cloned();
     if let Some(path) = &options.sequence {
         let mut config = config.unwrap_or_default();
         config.sequence.get_or_insert_default().path.clone_from(path);
@@ -161,8 +194,12 @@ impl<'a> Measured<'a> {
 }
 
 /// Depth of each pixel, metres, 0 where nothing is known.
-fn join(rendered: &Rendered, image: Option<&RectifiedImage>, source: Option<DepthSource>) -> Vec<f32> {
-    let of_map = |i: usize| if rendered.alpha(i) >= LEAST_ALPHA { rendered.expected_depth(i) } else { 0.0 };
+fn join(rendered: &Rendered, image: Option<&RectifiedImage>, source: Option<DepthSource>, map_depth: MapDepth) -> Vec<f32> {
+    let of_map = |i: usize| match map_depth {
+        _ if rendered.alpha(i) < LEAST_ALPHA => 0.0,
+        MapDepth::Centre | MapDepth::Plane => rendered.expected_depth(i),
+        MapDepth::Median => rendered.median_depth(i),
+    };
     let of_sensor = |i: usize| image.and_then(|image| image.depth.as_ref()).map_or(0.0, |depth| depth.metres[i]);
     let pixel = |i: usize| match source.unwrap_or(DepthSource::Both) {
         DepthSource::Rendered => of_map(i),

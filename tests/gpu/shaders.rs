@@ -1,18 +1,18 @@
 //! Every shader is valid WGSL with the entry points that the host asks for; no adapter is needed.
 
 use keysplat::render::layout::struct_layouts;
-use keysplat::render::{BlendForm, SHADERS, ShaderSource};
+use keysplat::render::{BlendForm, Blending, SHADERS, ShaderSource};
 use naga::valid::{Capabilities, ValidationFlags, Validator};
 
 #[test]
 fn every_shader_validates() {
     let faults: Vec<String> =
-        BlendForm::ALL.iter().flat_map(|&form| SHADERS.iter().filter_map(move |shader| validate(shader, form).err())).collect();
+        Blending::all().flat_map(|blending| SHADERS.iter().filter_map(move |shader| validate(shader, blending).err())).collect();
     assert!(faults.is_empty(), "{}", faults.join("\n"));
 }
 
-fn validate(shader: &ShaderSource, form: BlendForm) -> Result<(), String> {
-    let text = shader.text(form);
+fn validate(shader: &ShaderSource, blending: Blending) -> Result<(), String> {
+    let text = shader.text(blending);
     let module = naga::front::wgsl::parse_str(&text).map_err(|e| format!("{}: {}", shader.name, e.emit_to_string(&text)))?;
     Validator::new(ValidationFlags::all(), Capabilities::SHADER_FLOAT16_IN_FLOAT32)
         .validate(&module)

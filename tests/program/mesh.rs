@@ -66,6 +66,36 @@ fn a_run_becomes_a_mesh_near_the_true_surface() {
     refusals(&out);
 }
 
+/// Its Gaussians are flat, it repeats to the bit, and the planes of its Gaussians are nearer to the truth than their centres.
+#[test]
+fn a_planar_map_is_flat_and_its_planes_are_fused() {
+    if skipped_without_adapter() {
+        return;
+    }
+    let planar = ["--set", "mapping.surface=planar"];
+    let runs = ["planar", "planar-again"].map(|name| scratch().join(name));
+    runs.iter().for_each(|out| drop(finish(run_command(recording(), out, &planar)).succeeded()));
+    let [map, again] = runs.each_ref().map(|out| MapFormat::default().read(&out.join("map.ply")).unwrap());
+    assert_eq!(map, again);
+    let is_flat = |i: &usize| {
+        let mut axes = map.log_scales[*i].to_array();
+        axes.sort_by(f32::total_cmp);
+        axes[0] - axes[1] < 0.2f32.ln()
+    };
+    let flat = (0..map.len()).filter(is_flat).count();
+    assert!(map.first_non_finite().is_none() && flat * 10 > map.len() * 9, "{flat} of {}", map.len());
+    let files = ["", "centre", "plane", "median"].map(|depth| {
+        let more = if depth.is_empty() { vec![] } else { vec!["--map-depth", depth] };
+        let name = format!("planar-{depth}.ply");
+        let (said, file) = mesh(&runs[0], &name, &[&["--depth", "rendered", "--all-frames"], &more[..]].concat());
+        said.succeeded();
+        std::fs::read(file).unwrap()
+    });
+    assert!(files[0] == files[2] && files[0] != files[1] && files[2] != files[3], "planes are the default");
+    let refused = finish(run_command(recording(), &scratch().join("x"), &["--set", "mapping.planar.thickness=0"]));
+    refused.refused(&["mapping.planar", "thickness must lie between 0 and 1"]);
+}
+
 /// What is wrong ends in an error that says what to do, and in no file.
 fn refusals(out: &Path) {
     let refused = |name: &str, more: &[&str], parts: &[&str]| {

@@ -112,7 +112,8 @@ fn held_out(recording: &Recording, log: &TrackedLog, gpu: &Arc<Gpu>, mapped: &Ma
     let poses: Vec<_> = log.poses().iter().filter(|(index, _)| is_held_out(*index)).copied().collect();
     let MappedLog { cloud, exposures, .. } = mapped;
     let selection = ViewSelection { poses: &poses, keyframes: &BTreeSet::new(), is_held_out: &is_held_out, exposures };
-    let source = ViewSource { sequence: recording.sequence(), map_scale: config.map_scale, gpu, cloud };
+    let source =
+        ViewSource { sequence: recording.sequence(), map_scale: config.map_scale, gpu, cloud, surface: config.mapping.surface };
     evaluate_views(source, &selection, &mut |_| (), &|_| ()).into_diagnostic()
 }
 
