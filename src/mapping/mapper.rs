@@ -84,6 +84,8 @@ pub struct Mapper {
     host_times: HostTimes,
     /// Keyframes left of the running epoch of consolidation.
     epoch: Vec<usize>,
+    /// Whether a map of others began this one.
+    has_initial_map: bool,
     /// Whether the adapter has no room for more Gaussians, which is reported once.
     is_full: bool,
 }
@@ -110,6 +112,7 @@ impl Mapper {
             step_times: Vec::new(),
             host_times: HostTimes::default(),
             epoch: Vec::new(),
+            has_initial_map: false,
             is_full: false,
             config: Arc::new(config),
             gpu,

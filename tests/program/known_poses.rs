@@ -86,7 +86,7 @@ fn photos_are_mapped_from_points_whatever_their_unit() {
     assert!(psnr[0] > 24.0 && (psnr[0] - psnr[1]).abs() < 1.0, "{psnr:?}");
 }
 
-/// A map given back begins better than points do, and stays where it is.
+/// A map given back begins better than points do, and its first steps cost nothing.
 #[test]
 fn an_exported_map_given_back_begins_better_than_points() {
     let photos = colmap("given-back", 1.0);
@@ -122,7 +122,8 @@ fn an_exported_map_given_back_begins_better_than_points() {
         let name = format!("from-{format}");
         few(&name, &["--initial-map", map.to_str().unwrap()]).succeeded();
         let from_map = psnr(&scratch().join(name));
-        assert!(from_map > from_points, "{format}: {from_map}, from points {from_points}, its own {}", psnr(&first));
+        let own = psnr(&first);
+        assert!(from_map > from_points && from_map > own - 0.3, "{format}: {from_map}, from points {from_points}, its own {own}");
     }
 }
 

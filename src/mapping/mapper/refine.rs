@@ -1,7 +1,9 @@
 //! Consolidation: steps over all keyframes. Each epoch draws every keyframe once, in a seeded shuffle.
 //!
 //! Online, some steps of the running epoch follow each keyframe, at constant rates. The final refinement follows the last keyframe: steps at
-//! half size first, then at full size, with density control in between; rates fall exponentially, as 3DGS has it for positions.
+//! half size first, then at full size, with density control in between; rates fall exponentially, as 3DGS has it for positions. Where a map
+//! of others began the run, they first rise in proportion to the steps (Ma & Yarats 2021): Adam's first steps have the full length whatever
+//! the gradient, which a map that is good already does not survive.
 
 use std::ops::ControlFlow;
 use std::time::Instant;
@@ -16,6 +18,8 @@ use super::{BATCH, Interlude, Mapper, Step, Taken};
 
 /// Share of the steps after which nothing is pruned: neighbours take some epochs to fill the place of a Gaussian.
 const LAST_CONTROL: f32 = 0.8;
+/// Steps in which the rates of a map of others rise: half of those that the second moments remember.
+const WARM_UP_STEPS: usize = 500;
 
 /// Where a refinement stands; begun by [`Mapper::begin_refinement`].
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -28,6 +32,8 @@ pub struct FinalRefinement {
     #[serde(skip)]
     more: usize,
     rounds: usize,
+    /// Steps in which the rates rise; none where points or keyframes began the map.
+    warm_up: usize,
     /// Measurements of the exposures so far.
     pub(super) exposed: usize,
     /// A refinement of so many seconds has no checkpoint.
@@ -85,7 +91,8 @@ impl FinalRefinement {
 
     /// The rates for the next step.
     fn rates(&self) -> AdamConfig {
-        let fallen = |to: f32| to.powf(self.progress());
+        let risen = if self.done < self.warm_up { (self.done + 1) as f32 / self.warm_up as f32 } else { 1.0 };
+        let fallen = |to: f32| risen * to.powf(self.progress());
         self.adam.scaled(fallen(self.config.final_lr_scale_position), fallen(self.config.final_lr_scale))
     }
 }
@@ -149,7 +156,8 @@ impl Mapper {
         };
         let started = config.seconds.map(|_| Instant::now());
         self.epoch.clear();
-        Ok(FinalRefinement { adam: self.config.adam.clone(), config, done: 0, more: 0, rounds: 0, exposed: 0, started })
+        let warm_up = if self.has_initial_map { WARM_UP_STEPS } else { 0 };
+        Ok(FinalRefinement { adam: self.config.adam.clone(), config, done: 0, more: 0, rounds: 0, warm_up, exposed: 0, started })
     }
 
     /// The steps up to the next density control, and that; `None` when all are done, or `interlude` ends them.

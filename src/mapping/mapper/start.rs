@@ -31,6 +31,7 @@ impl Mapper {
     pub fn add_map(&mut self, map: &GaussianCloud, anchor: KeyframeId) -> Result<(), MappingError> {
         let mut new = GaussianCloud::new(self.config.sh_degree);
         (0..map.len()).filter_map(|i| tamed(map.get(i))).for_each(|gaussian| new.push(gaussian));
+        self.has_initial_map = true;
         self.begin_with(new, anchor)
     }
 

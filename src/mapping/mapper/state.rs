@@ -25,6 +25,7 @@ pub struct MapperState {
     step_times: Vec<Duration>,
     /// Keyframes left of the running epoch.
     epoch: Vec<usize>,
+    has_initial_map: bool,
     refinement: Option<FinalRefinement>,
 }
 
@@ -42,6 +43,7 @@ impl Mapper {
             rng: self.rng.get_seed(),
             step_times: self.step_times.clone(),
             epoch: self.epoch.clone(),
+            has_initial_map: self.has_initial_map,
             refinement: refinement.cloned(),
         })
     }
@@ -66,6 +68,7 @@ impl Mapper {
         mapper.rng = Rng::with_seed(state.rng);
         mapper.step_times = state.step_times.clone();
         mapper.epoch = state.epoch.clone();
+        mapper.has_initial_map = state.has_initial_map;
         Ok(mapper)
     }
 
