@@ -342,7 +342,8 @@ impl Mapper {
             let keyframe = &self.keyframes[step.keyframe];
             let view = keyframe.view(step.coarse);
             let depth_confidence = if keyframe.depth_is_estimated() { self.config.plane_sweep.depth_confidence } else { 1.0 };
-            TrainingView { streamed: pixels.as_deref(), depth_confidence, scored: step.scored, dropout: step.dropout, ..view }
+            let Step { scored, dropout, surface_share, .. } = *step;
+            TrainingView { streamed: pixels.as_deref(), depth_confidence, scored, dropout, surface_share, ..view }
         });
         let views: Vec<TrainingView<'_>> = views.collect();
         let started = Instant::now();

@@ -15,13 +15,15 @@ pub(super) struct Step {
     pub coarse: bool,
     /// Gaussians that it leaves out.
     pub dropout: Dropout,
+    /// Factor on the weights of a planar surface, 0 to 1.
+    pub surface_share: f32,
     /// Whether the step also scores the Gaussians.
     pub scored: Option<ErrorPixels>,
 }
 
 impl Step {
     pub fn new(keyframe: usize) -> Self {
-        Self { keyframe, coarse: false, dropout: Dropout::default(), scored: None }
+        Self { keyframe, coarse: false, dropout: Dropout::default(), surface_share: 0.0, scored: None }
     }
 }
 

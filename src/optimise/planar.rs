@@ -9,7 +9,8 @@ const LEAST_ALPHA: f32 = 0.5;
 /// Neighbouring pixels whose depths differ by more than this share lie on different surfaces.
 const EDGE: f32 = 0.05;
 
-/// Weights of a planar surface, used where `mapping.surface` is `planar` (2DGS, Huang et al. 2024; PGSR, Chen et al. 2024).
+/// Weights of a planar surface, used where `mapping.surface` is `planar` (2DGS, Huang et al. 2024; PGSR, Chen et al. 2024). They rise linearly
+/// over the final refinement: surfaces that do not exist yet have no normals.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct PlanarConfig {
@@ -39,9 +40,8 @@ impl PlanarConfig {
         if self.thickness > 0.0 && self.thickness <= 1.0 { Ok(()) } else { Err("thickness must lie between 0 and 1".into()) }
     }
 
-    /// The GPU's copy for a view of so many pixels.
-    pub(super) fn setup(&self, pixels: u32) -> SurfaceSetup {
-        let per_pixel = 1.0 / pixels as f32;
+    /// The GPU's copy with this factor of each pixel's term.
+    pub(super) fn setup(&self, per_pixel: f32) -> SurfaceSetup {
         SurfaceSetup {
             normal_weight: self.normal_weight * per_pixel,
             spread_weight: self.spread_weight * per_pixel,

@@ -47,13 +47,15 @@ pub struct TrainingView<'a> {
     pub exposure: Exposure,
     /// Gaussians that the step leaves out.
     pub dropout: Dropout,
+    /// Factor on the weights of a planar surface, 0 to 1.
+    pub surface_share: f32,
 }
 
 impl<'a> TrainingView<'a> {
     /// The whole view at full learning rates and in the map's exposure, not scored.
     pub fn new(camera: ViewCamera, target: &'a TargetImage) -> Self {
         let (exposure, dropout) = Default::default();
-        Self { camera, target, streamed: None, scored: None, depth_confidence: 1.0, exposure, dropout }
+        Self { camera, target, streamed: None, scored: None, depth_confidence: 1.0, exposure, dropout, surface_share: 1.0 }
     }
 }
 

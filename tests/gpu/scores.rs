@@ -2,13 +2,15 @@
 
 use fastrand::Rng;
 use image::{Rgb, RgbImage};
-use keysplat::optimise::{AdamConfig, ErrorPixels, LossConfig, TargetImage, Trainer, TrainingView, ssim_phase};
-use keysplat::render::{BlendForm, GpuCloud};
+use keysplat::optimise::{AdamConfig, ErrorPixels, LossConfig, PlanarConfig, TargetImage, Trainer, TrainingView, ssim_phase};
+use keysplat::render::{Blending, GpuCloud};
 use keysplat::splat::ShDegree;
 use keysplat::verification::reference::loss::{LossWeights, Target64, loss};
 use keysplat::verification::reference::scores::scores;
-use keysplat::verification::reference::{Cutoffs, View64, cloud64, rasterize_forward};
+use keysplat::verification::reference::{View64, cloud64, rasterize_forward};
 use nalgebra::Vector3;
+
+use crate::oracle::view64;
 
 const TOLERANCE: f64 = 1e-3;
 
@@ -18,20 +20,15 @@ fn scores_are_those_of_their_definition() {
     let (loss_config, wrong_config) =
         (LossConfig { depth_weight: 0.0, ..LossConfig::default() }, ErrorPixels { error_ratio: 1.2, noise: 0.05 });
     let mut clear_cuts = 0;
-    for (seed, form) in (0..3).flat_map(|seed| BlendForm::ALL.map(|form| (seed, form))) {
+    let still = PlanarConfig { normal_weight: 0.0, spread_weight: 0.0, ..PlanarConfig::default() };
+    for (seed, blending) in (0..3).flat_map(|seed| Blending::all().map(move |blending| (seed, blending))) {
         let mut rng = Rng::with_seed(40 + seed);
         let camera = crate::common::camera(&mut rng, 40, 24);
         let cloud = crate::common::scene(&mut rng, 40, ShDegree::ALL[0]);
         let (width, height) = (camera.pinhole.width, camera.pinhole.height);
         let image = RgbImage::from_fn(width, height, |_, _| Rgb([rng.u8(..), rng.u8(..), rng.u8(..)]));
 
-        let view = View64 {
-            camera,
-            background: Vector3::zeros(),
-            cutoffs: Cutoffs::Sharp,
-            antialiased: false,
-            surface: Default::default(),
-        };
+        let view = View64 { background: Vector3::zeros(), ..view64(&camera, &cloud, blending.surface) };
         let cloud_64 = cloud64(&cloud);
         let rendered = rasterize_forward::render(&view, &cloud_64);
         let color: Vec<Vector3<f64>> = image.pixels().map(|p| Vector3::from(p.0.map(|c| f64::from(c) / 255.0))).collect();
@@ -46,7 +43,7 @@ fn scores_are_those_of_their_definition() {
         let (total, by_image) = loss(&rendered, &target, &weights);
         let expected = scores(&view, &cloud_64, &by_image, &wrong);
 
-        let mut trainer = Trainer::with_blending(gpu.clone(), form).unwrap();
+        let mut trainer = Trainer::with_blending(gpu.clone(), blending).unwrap().with_planar(still);
         let mut on_gpu = GpuCloud::new(&gpu, cloud.sh_degree, cloud.len()).unwrap();
         on_gpu.append(&gpu, &cloud).unwrap();
         let target = TargetImage::new(&gpu, &image, None).unwrap();
@@ -62,7 +59,7 @@ fn scores_are_those_of_their_definition() {
         let compare = |name: &str, found: Vec<f32>, expected: Vec<f64>| {
             let found: Vec<f64> = found.into_iter().map(f64::from).collect();
             let error = crate::common::relative_error(&found, &expected);
-            assert!(error < TOLERANCE, "{name}, seed {seed}, {form:?}: {error:e}");
+            assert!(error < TOLERANCE, "{name}, seed {seed}, {blending:?}: {error:e}");
         };
         compare("Σ w", found.iter().map(|s| s.weight_sum).collect(), expected.iter().map(|s| 2.0 * s.weight_sum).collect());
         compare("largest w", found.iter().map(|s| s.weight_max).collect(), expected.iter().map(|s| s.weight_max).collect());
@@ -79,7 +76,7 @@ fn scores_are_those_of_their_definition() {
             compare("weighted wrong pixels", found.iter().map(|s| s.weighted_error_pixels).collect(), weighted);
         }
         let views = |s: &f32, e: f64| *s == if e > 0.0 { 2.0 } else { 0.0 };
-        assert!(found.iter().zip(&expected).all(|(s, e)| views(&s.views, e.weight_sum)), "seed {seed}, {form:?}");
+        assert!(found.iter().zip(&expected).all(|(s, e)| views(&s.views, e.weight_sum)), "seed {seed}, {blending:?}");
     }
     assert!(clear_cuts > 0, "high-error pixels were never compared");
 }

@@ -156,7 +156,11 @@ impl Mapper {
         };
         let started = config.seconds.map(|_| Instant::now());
         self.epoch.clear();
-        let warm_up = if self.has_initial_map { WARM_UP_STEPS } else { 0 };
+        let mut warm_up = 0;
+        if self.has_initial_map {
+            // It has the detail that steps at half size would take from it.
+            (warm_up, config.half_size_share) = (WARM_UP_STEPS, 0.0);
+        }
         Ok(FinalRefinement { adam: self.config.adam.clone(), config, done: 0, more: 0, rounds: 0, warm_up, exposed: 0, started })
     }
 
@@ -185,6 +189,7 @@ impl Mapper {
             let coarse = refinement.progress() < half_size_share;
             let mut batch = self.draw(BATCH.min(end - refinement.done), coarse);
             self.drop_out(&mut batch, refinement.config.dropout * refinement.progress());
+            batch.iter_mut().for_each(|step| step.surface_share = refinement.progress());
             adam = refinement.rates();
             taken += self.steps(&batch, &adam, None)?.0;
             refinement.done += batch.len();

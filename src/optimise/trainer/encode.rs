@@ -42,7 +42,7 @@ impl Trainer {
         let is_planar = self.rasterizer.blending().surface == Surface::Planar;
         let uniforms = &mut self.rasterizer.uniforms;
         StepUniforms {
-            surface: is_planar.then(|| uniforms.put(&self.planar.setup(prepared.view.pixels()))),
+            surface: is_planar.then(|| uniforms.put(&self.planar.setup(view.surface_share / prepared.view.pixels() as f32))),
             loss: uniforms.put(&setup),
             scores: view.scored.map(|pixels| uniforms.put(&pixels.setup(loss, prepared.view.pixels()))),
         }
