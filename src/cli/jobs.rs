@@ -137,7 +137,7 @@ fn status(args: &StatusArgs) -> miette::Result<()> {
 }
 
 fn merge(plan: &Plan, allow_holes: bool) -> Result<End, JobError> {
-    let merged = jobs::merge(plan, allow_holes)?;
+    let merged = jobs::merge(plan, &slurm::states(plan), allow_holes)?;
     merged.holes.iter().for_each(|hole| tracing::warn!("{hole}"));
     Ok(End { text: merged.table, status: if merged.holes.is_empty() { 0 } else { WITH_HOLES } })
 }

@@ -34,12 +34,14 @@ impl Input {
     ///
     /// # Errors
     /// If a file cannot be read, or the digests cannot be written.
-    pub(super) fn measure(plan: &Path, number: usize, path: PathBuf) -> Result<Self, JobError> {
+    pub(super) fn measure(plan: &Path, path: PathBuf) -> Result<Self, JobError> {
         let lines = lines(&plan.join(&path))?.concat();
-        let digests = Path::new(INPUTS).join(format!("{number}.sha256"));
+        let sha256 = sha256_hex(lines.as_bytes());
+        // Named by its content, so that no other plan's file is replaced.
+        let digests = Path::new(INPUTS).join(format!("{}.sha256", &sha256[..16]));
         create_folder(&plan.join(INPUTS))?;
         write_durably(&plan.join(&digests), lines.as_bytes())?;
-        Ok(Self { path, digests, sha256: sha256_hex(lines.as_bytes()) })
+        Ok(Self { path, digests, sha256 })
     }
 
     /// Reads the input again and compares it.
@@ -55,8 +57,8 @@ impl Input {
         let listed = std::fs::read_to_string(plan.join(&self.digests)).unwrap_or_default();
         let then: Vec<&str> = listed.split_inclusive('\n').collect();
         let folder = if path.is_dir() { path.as_path() } else { path.parent().unwrap_or(Path::new("")) };
-        let changed = now.iter().map(String::as_str).filter(|line| !then.contains(line)).chain(then.iter().copied());
-        let first = changed.into_iter().find(|line| !(now.iter().any(|l| l == line) && then.contains(line)));
+        let changed = now.iter().map(String::as_str).find(|line| !then.contains(line));
+        let first = changed.or_else(|| then.iter().copied().find(|line| !now.iter().any(|l| l == line)));
         let file = first.and_then(|line| line.trim_end().split_once("  ")).map_or(path.clone(), |(_, name)| folder.join(name));
         let reason = if file.exists() { "is not what it was when the plan was made" } else { "is missing" };
         Err(JobError::Input { path: file, reason: reason.into() })

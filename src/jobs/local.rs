@@ -6,7 +6,6 @@ use std::process::{Child, Command, Stdio};
 use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
-use super::status::TaskStatus;
 use super::{AGAIN, JobError, Plan};
 
 /// Pause before a task that another process has is tried again.
@@ -38,8 +37,9 @@ pub fn run_all(
             command.arg("--quiet").args(["jobs", "run"]).arg(plan.folder()).args(["--task", &number.to_string()]);
             let mut child = command.stdin(Stdio::null()).stdout(Stdio::null()).spawn().map_err(failed)?;
             let code = wait(&mut child, is_stopped).map_err(failed)?;
-            if TaskStatus::goes_on(code) && !is_stopped() {
-                if code == Some(i32::from(AGAIN)) {
+            let again = code == Some(i32::from(AGAIN));
+            if (again || code.is_none()) && !is_stopped() {
+                if again {
                     std::thread::sleep(BUSY_WAIT);
                 }
                 queue.lock().unwrap_or_else(PoisonError::into_inner).push_back(number);

@@ -1,9 +1,11 @@
 //! The results of all tasks as one table; every task without a result is named.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
+use super::slurm::SlurmState;
 use super::task::{TaskResult, failure, result_folder};
 use super::{JobError, Plan, Work};
 use crate::evaluation::{Metrics, sha256_hex};
@@ -42,11 +44,12 @@ pub struct Merge {
     pub table: String,
 }
 
-/// Verifies all results and writes the table of `bench sweep` or `bench track`, and `merge.json`, into the plan's folder.
+/// Verifies all results and writes the table of `bench sweep` or `bench track`, and `merge.json`, into the plan's folder. `engine` has the
+/// states that an engine reports.
 ///
 /// # Errors
 /// Names all holes unless they are allowed. If nothing is done, or a file cannot be read or written.
-pub fn merge(plan: &Plan, allow_holes: bool) -> Result<Merge, JobError> {
+pub fn merge(plan: &Plan, engine: &BTreeMap<usize, SlurmState>, allow_holes: bool) -> Result<Merge, JobError> {
     let (mut done, mut holes, mut digests) = (Vec::new(), Vec::new(), String::new());
     for (number, task) in plan.tasks.iter().enumerate() {
         match TaskResult::verified(plan, number) {
@@ -55,8 +58,9 @@ pub fn merge(plan: &Plan, allow_holes: bool) -> Result<Merge, JobError> {
                 done.push(number);
             }
             Err(reason) => {
-                let reason = failure(plan, number).map_or(reason, |failure| failure.reason);
-                holes.push(Hole { task: number, name: task.name.clone(), reason });
+                let ended = failure(plan, number).map(|failure| failure.reason);
+                let ended = ended.or_else(|| Some(format!("{reason}; Slurm: {}", engine.get(&number)?)));
+                holes.push(Hole { task: number, name: task.name.clone(), reason: ended.unwrap_or(reason) });
             }
         }
     }

@@ -124,7 +124,7 @@ impl Draft {
         if let Some(number) = self.0.inputs.iter().position(|input| input.path == path) {
             return Ok(number);
         }
-        self.0.inputs.push(Input::measure(&self.0.folder, self.0.inputs.len(), path)?);
+        self.0.inputs.push(Input::measure(&self.0.folder, path)?);
         Ok(self.0.inputs.len() - 1)
     }
 

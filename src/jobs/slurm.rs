@@ -106,9 +106,11 @@ fn text_of_script(plan: &Plan, program: &Path) -> String {
         r#"#!/bin/bash
 # One task of a keysplat plan; $1 is the number of the array's first task.
 task=$(($1 + SLURM_ARRAY_TASK_ID))
-trap 'kill -USR1 "$child" 2>/dev/null' USR1 TERM
+leave() {{ leaving=1; [ -z "$child" ] || kill -USR1 "$child" 2>/dev/null; }}
+trap leave USR1 TERM
 {program} --quiet jobs run {folder} --task "$task" &
 child=$!
+[ -z "$leaving" ] || leave
 wait "$child"
 status=$?
 # A trapped signal ends `wait`, not the task.

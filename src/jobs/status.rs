@@ -5,9 +5,9 @@ use std::fmt::Write;
 
 use serde::Serialize;
 
+use super::Plan;
 use super::slurm::SlurmState;
 use super::task::{TaskResult, attempts, failure};
-use super::{AGAIN, Plan};
 use crate::evaluation::sha256_hex;
 use crate::run_folder::FolderLock;
 
@@ -92,12 +92,5 @@ impl State {
             Self::Running => "running",
             Self::Failed => "failed",
         }
-    }
-}
-
-impl TaskStatus {
-    /// Whether the status of a process is worth another one at once.
-    pub fn goes_on(exit_status: Option<i32>) -> bool {
-        exit_status.is_none_or(|status| status == i32::from(AGAIN))
     }
 }

@@ -77,7 +77,7 @@ fn a_plan_is_read_as_it_was_written() {
     let read = Plan::read(bench.plan.folder()).unwrap();
     assert_eq!(read, bench.plan);
     assert_eq!(read.inputs.len(), 1);
-    let digests = std::fs::read_to_string(bench.file("plan/inputs/0.sha256")).unwrap();
+    let digests = std::fs::read_to_string(bench.plan.folder().join(&read.inputs[0].digests)).unwrap();
     assert_eq!(digests.lines().map(|line| &line[64..]).collect::<Vec<_>>(), ["  list.txt", "  rgb/0.png"]);
     // The same again, and another one.
     Bench::draft(bench.folder.path(), 2).finish().unwrap();
@@ -98,7 +98,7 @@ fn a_task_is_made_once() {
     // A result that was damaged is made again, and is the same.
     let row = bench.file("plan/tasks/0000/result/replay.json");
     std::fs::write(&row, b"{}").unwrap();
-    assert!(merge(&bench.plan, true).unwrap_err().to_string().contains("replay.json is damaged"));
+    assert!(merge(&bench.plan, &BTreeMap::new(), true).unwrap_err().to_string().contains("replay.json is damaged"));
     assert_eq!(bench.run(0).unwrap(), Ended::Made);
     assert_eq!(digest(&bench.plan), first);
     let left: Vec<_> = std::fs::read_dir(bench.plan.task_folder(0)).unwrap().map(|entry| entry.unwrap().file_name()).collect();
@@ -167,16 +167,16 @@ fn holes_are_named_and_refused_or_recorded() {
     bench.run(0).unwrap();
     let mut poison = |_: &Task, _: &Path| Err(WorkError::Failed("it always fails".into()));
     assert_eq!(run_task(&bench.plan, 1, &mut poison).unwrap_err().exit_status(), FAILED);
-    let refused = merge(&bench.plan, false).unwrap_err().to_string();
+    let refused = merge(&bench.plan, &BTreeMap::new(), false).unwrap_err().to_string();
     for part in ["task 1 (replay 1): it always fails", "task 2 (replay 2): it has no result", "2 of 3 tasks", "--allow-holes"] {
         assert!(refused.contains(part), "{refused}");
     }
-    let merged = merge(&bench.plan, true).unwrap();
+    let merged = merge(&bench.plan, &BTreeMap::new(), true).unwrap();
     assert_eq!((merged.done, merged.holes.len()), (1, 2));
     let text = std::fs::read_to_string(bench.file("plan/merge.json")).unwrap();
     assert!(text.contains("it always fails") && merged.table.contains("| recording | default | 1 |"));
     (1..3).for_each(|task| assert_eq!(bench.run(task).unwrap(), Ended::Made));
-    let merged = merge(&bench.plan, false).unwrap();
+    let merged = merge(&bench.plan, &BTreeMap::new(), false).unwrap();
     assert_eq!(Some(merged.digest), digest(&bench.plan));
     let table = to_table(&status(&bench.plan, &BTreeMap::new()));
     assert!(table.contains("3 done, 0 waiting, 0 running, 0 failed"), "{table}");
