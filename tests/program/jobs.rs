@@ -11,10 +11,12 @@ use crate::common::recording::{
 /// No task here takes longer to a checkpoint.
 const HANGS_AFTER: Duration = Duration::from_secs(180);
 /// A keyframe for nearly each frame and a checkpoint for each keyframe, so that there are many moments between two.
-const OPTIONS: [&str; 7] = [
+const OPTIONS: [&str; 9] = [
     "--",
     "--set",
-    "tracking.keyframe_translation=0.005",
+    "tracking.keyframe_translation=0.02",
+    "--set",
+    "mapping.first_iterations=20",
     "--set",
     "mapping.iterations_per_keyframe=10",
     "--checkpoint-every",
