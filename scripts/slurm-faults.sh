@@ -7,7 +7,7 @@ set -euo pipefail
 tasks=${1:-12}
 shift "$(($# < 1 ? $# : 1))"
 faults=(none "$@")
-[ ${#faults[@]} -gt 1 ] || faults=(none kill-task kill-slurmd kill-controller short-limit hard-limit disk-full corrupted-input poison two-submissions)
+[ ${#faults[@]} -gt 1 ] || faults=(none kill-task kill-slurmd kill-node kill-controller short-limit hard-limit disk-full corrupted-input poison two-submissions)
 keysplat=$(realpath "${KEYSPLAT:-target/release/keysplat}")
 for program in sbatch slurmctld slurmd munged; do
     PATH=$PATH:/usr/sbin command -v "$program" >/dev/null || { echo "SKIPPED: $program is not installed; apt-get install slurm-wlm munge" >&2; exit 0; }
@@ -81,7 +81,7 @@ wait_until() {
     local seconds=$1 end
     end=$((SECONDS + seconds))
     shift
-    until "$@"; do
+    until "$@" >/dev/null; do
         [ "$SECONDS" -lt "$end" ] || return 1
         sleep 0.5
     done
@@ -105,16 +105,32 @@ digest() { status_of --json | sed -n 's/.*"digest": "\(.*\)".*/\1/p' | head -1; 
 # What each fault does between a submission and its end.
 none() { submit; }
 kill-task() { submit; wait_until 60 some_run; kill -9 "$(a_task)"; }
+# The daemon alone: the task goes on as an orphan, and Slurm starts it again elsewhere or learns of its end.
 kill-slurmd() {
     submit
-    wait_until 60 some_run
-    sleep 2
+    wait_until 60 task_on_n2
     kill -9 "$(pid_of slurmd.n2)"
-    # The node is dead for Slurm, its orphan goes on; later it comes back.
-    sleep 25
-    echo "$(squeue -h -r -o '%i %T %r' | head -3 | paste -sd';')" >"$work/seen"
+    wait_until 120 node_down || echo "n2 was not missed" >&2
     slurmd -N n2
 }
+# All that a dead node takes along: the daemon, the task, its script and their parent.
+kill-node() {
+    submit
+    wait_until 60 task_on_n2
+    local task script
+    task=$(task_on_n2) script=$(ps -o ppid= -p "$task")
+    kill -9 "$(pid_of slurmd.n2)" "$(ps -o ppid= -p "$script" | tr -d ' ')" $script "$task"
+    wait_until 120 node_down || echo "n2 was not missed" >&2
+    slurmd -N n2
+}
+task_on_n2() {
+    local pid
+    for pid in $(pgrep -f "^$keysplat --quiet jobs run $plan --task"); do
+        ! tr '\0' '\n' <"/proc/$pid/environ" 2>/dev/null | grep -qx SLURMD_NODENAME=n2 || { echo "$pid" && return; }
+    done
+    return 1
+}
+node_down() { [[ $(sinfo -h -n n2 -o %T) = down* ]]; }
 kill-controller() { submit; wait_until 60 some_run; kill -9 "$(pid_of slurmctld)"; sleep 8; slurmctld; }
 # Tasks of minutes with a limit of one: each leaves with a checkpoint, is requeued and goes on.
 short-limit() { submit --time=1 --signal=B:USR1@30; }
