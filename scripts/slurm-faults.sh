@@ -88,7 +88,7 @@ wait_until() {
 }
 jobs_over() { [ -z "$(squeue -h 2>/dev/null)" ] && squeue -h >/dev/null 2>&1; }
 some_run() { [ "$(ls -d "$plan"/tasks/*/working 2>/dev/null | wc -l)" -ge 2 ]; }
-later_run() { [ "$(ls -d "$plan"/tasks/*/result 2>/dev/null | wc -l)" -ge 1 ] && some_run; }
+later_run() { [ "$(ls -d "$plan"/tasks/*/result 2>/dev/null | wc -l)" -ge 1 ]; }
 
 new_plan() {
     local epochs=$1 count=$2
@@ -104,11 +104,11 @@ digest() { status_of --json | sed -n 's/.*"digest": "\(.*\)".*/\1/p' | head -1; 
 
 # What each fault does between a submission and its end.
 none() { submit; }
-kill-task() { submit; wait_until 60 some_run; kill -9 "$(a_task)"; }
+kill-task() { submit; wait_until 180 some_run; kill -9 "$(a_task)"; }
 # The daemon alone: the task goes on as an orphan, and Slurm starts it again elsewhere or learns of its end.
 kill-slurmd() {
     submit
-    wait_until 60 task_on_n2
+    wait_until 180 task_on_n2
     kill -9 "$(pid_of slurmd.n2)"
     wait_until 120 node_down || echo "n2 was not missed" >&2
     slurmd -N n2
@@ -116,7 +116,7 @@ kill-slurmd() {
 # All that a dead node takes along: the daemon, the task, its script and their parent.
 kill-node() {
     submit
-    wait_until 60 task_on_n2
+    wait_until 180 task_on_n2
     local task script
     task=$(task_on_n2) script=$(ps -o ppid= -p "$task")
     kill -9 "$(pid_of slurmd.n2)" "$(ps -o ppid= -p "$script" | tr -d ' ')" $script "$task"
@@ -131,7 +131,7 @@ task_on_n2() {
     return 1
 }
 node_down() { [[ $(sinfo -h -n n2 -o %T) = down* ]]; }
-kill-controller() { submit; wait_until 60 some_run; kill -9 "$(pid_of slurmctld)"; sleep 8; slurmctld; }
+kill-controller() { submit; wait_until 180 some_run; kill -9 "$(pid_of slurmctld)"; sleep 8; slurmctld; }
 # Tasks of minutes with a limit of one: each leaves with a checkpoint, is requeued and goes on.
 short-limit() { submit --time=1 --signal=B:USR1@30; }
 # The same without the early signal, and without requeueing: Slurm's own end.
@@ -141,7 +141,7 @@ disk-full() {
     mount -t tmpfs -o size=${FULL_SIZE:-300k} tmpfs "$plan/tasks/0003"
     submit
 }
-corrupted-input() { submit; wait_until 60 later_run; printf 'x' | dd of="$(ls "$work"/room/rgb/*.png | head -7 | tail -1)" bs=1 seek=100 conv=notrunc status=none; }
+corrupted-input() { submit; wait_until 180 later_run; printf 'x' | dd of="$(ls "$work"/room/rgb/*.png | head -7 | tail -1)" bs=1 seek=100 conv=notrunc status=none; }
 # Its adapter does not exist.
 poison() {
     sed -i '0,/"options": \[/s//"options": [ "--adapter", "no-such-adapter",/' "$plan/plan.json"
