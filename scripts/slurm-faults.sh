@@ -118,8 +118,8 @@ kill-node() {
     submit
     wait_until 180 task_on_n2
     local task script
-    task=$(task_on_n2) script=$(ps -o ppid= -p "$task")
-    kill -9 "$(pid_of slurmd.n2)" "$(ps -o ppid= -p "$script" | tr -d ' ')" $script "$task"
+    task=$(task_on_n2) script=$(ps -o ppid= -p "$(task_on_n2)" | tr -d ' ')
+    kill -9 "$(pid_of slurmd.n2)" "$(ps -o ppid= -p "$script" | tr -d ' ')" "$script" "$task"
     wait_until 120 node_down || echo "n2 was not missed" >&2
     slurmd -N n2
 }
