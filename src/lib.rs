@@ -13,6 +13,7 @@ pub mod film;
 pub mod geometry;
 pub mod gpu;
 pub mod inspection;
+pub mod jobs;
 pub mod mapping;
 pub mod mesh;
 pub mod optimise;

@@ -3,7 +3,7 @@
 mod ablation;
 mod host;
 mod sweep;
-mod track;
+pub(super) mod track;
 mod walk;
 
 use std::path::{Path, PathBuf};

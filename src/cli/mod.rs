@@ -9,6 +9,7 @@ mod eval;
 mod eval_mesh;
 mod export;
 mod generate;
+mod jobs;
 mod keys;
 mod mesh;
 mod progress;
@@ -79,6 +80,8 @@ enum Command {
     View(view::ViewArgs),
     /// Measure speed.
     Bench(bench::BenchArgs),
+    /// Run the tasks of a plan, on this machine or on a cluster, and merge their results.
+    Jobs(jobs::JobsArgs),
     /// Try thousands of nasty cases against what is known of them.
     Stress(stress::StressArgs),
     /// List the adapters that the mapper could use.
@@ -102,20 +105,26 @@ pub fn main() -> ExitCode {
     let cli = Cli::parse();
     let verbosity = Verbosity { quiet: cli.quiet, json: cli.log == LogFormat::Json };
     match start_log(verbosity).and_then(|()| execute(cli.command, verbosity)) {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(report) if verbosity.json => {
-            tracing::error!("{report}");
-            ExitCode::FAILURE
-        }
+        Ok(status) => status,
         Err(report) => {
-            eprintln!("Error: {report:?}");
+            print_error(&report, verbosity);
             ExitCode::FAILURE
         }
     }
 }
 
-fn execute(command: Command, verbosity: Verbosity) -> miette::Result<()> {
+/// Prints an error on standard error, in the requested form.
+fn print_error(report: &miette::Report, verbosity: Verbosity) {
+    if verbosity.json {
+        tracing::error!("{report}");
+    } else {
+        eprintln!("Error: {report:?}");
+    }
+}
+
+fn execute(command: Command, verbosity: Verbosity) -> miette::Result<ExitCode> {
     match command {
+        Command::Jobs(args) => return jobs::jobs(&args, verbosity),
         Command::Check(args) => check::check(&args, verbosity),
         Command::Calibrate(args) => calibrate::calibrate(&args, verbosity),
         Command::Run(args) => run::run(&args, verbosity),
@@ -132,7 +141,8 @@ fn execute(command: Command, verbosity: Verbosity) -> miette::Result<()> {
         Command::Bench(args) => bench::bench(&args, verbosity),
         Command::Stress(args) => stress::stress(&args),
         Command::Adapters => adapters::adapters(),
-    }
+    }?;
+    Ok(ExitCode::SUCCESS)
 }
 
 fn start_log(verbosity: Verbosity) -> miette::Result<()> {

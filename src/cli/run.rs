@@ -121,6 +121,43 @@ pub fn parse_range(text: &str) -> Result<(usize, usize), String> {
 }
 
 impl RunArgs {
+    /// The same with the camera found, where it is to be found from the frames.
+    pub fn calibrated(&self, verbosity: Verbosity) -> miette::Result<Self> {
+        let mut args = self.clone();
+        if args.source.camera.as_deref() == Some(ASSUMED_CAMERA) {
+            let path = args.sequence.as_deref().ok_or_else(|| miette!("--camera auto needs the recording's folder or video"))?;
+            std::fs::create_dir_all(&args.out).into_diagnostic()?;
+            let file = args.out.join("camera.toml");
+            let range = args.frames.map(|(start, end)| (start, end.min(start.saturating_add(calibrate::FRAMES))));
+            find_camera(path, args.source.layout, range, &file, verbosity)?;
+            args.source.camera = Some(file.to_string_lossy().into_owned());
+        }
+        Ok(args)
+    }
+
+    /// Files that a run reads: its recording, and those that options or the configuration name.
+    pub fn inputs(&self) -> miette::Result<Vec<PathBuf>> {
+        let config = self.resolve(self.preset, None)?;
+        let sequence = config.sequence.unwrap_or_default();
+        let camera = sequence.camera.filter(|camera| is_camera_file(camera)).map(PathBuf::from);
+        let all = [Some(sequence.path), self.config.clone(), camera, config.initial_map];
+        Ok(all.into_iter().flatten().collect())
+    }
+
+    /// Keeps a checkpoint after every so many keyframes, unless it is kept already or the run does not repeat.
+    ///
+    /// # Errors
+    /// If the recording or the configuration cannot be used.
+    pub fn keep_checkpoints(&mut self, every: usize) -> miette::Result<()> {
+        let config = self.resolve(self.preset, None)?;
+        let repeats = !config.replay.real_time && !config.mapping.depends_on_time();
+        if repeats && config.checkpoint_every.is_none() {
+            self.checkpoint_every = Some(every);
+        }
+        Recording::open(self.resolve(self.preset, None)?).into_diagnostic()?;
+        Ok(())
+    }
+
     /// Opens the recording and the adapter. Without a file, a preset and a mapping resolution that are not given follow from the adapter.
     pub fn open(&self) -> miette::Result<(Recording, Arc<Gpu>)> {
         let recording = Recording::open(self.resolve(self.preset, None)?).into_diagnostic()?;
@@ -181,15 +218,7 @@ impl RunArgs {
 }
 
 pub fn run(args: &RunArgs, verbosity: Verbosity) -> miette::Result<()> {
-    let mut args = args.clone();
-    if args.source.camera.as_deref() == Some(ASSUMED_CAMERA) {
-        let path = args.sequence.as_deref().ok_or_else(|| miette!("--camera auto needs the recording's folder or video"))?;
-        std::fs::create_dir_all(&args.out).into_diagnostic()?;
-        let file = args.out.join("camera.toml");
-        let range = args.frames.map(|(start, end)| (start, end.min(start.saturating_add(calibrate::FRAMES))));
-        find_camera(path, args.source.layout, range, &file, verbosity)?;
-        args.source.camera = Some(file.to_string_lossy().into_owned());
-    }
+    let args = args.calibrated(verbosity)?;
     let (recording, gpu) = args.open()?;
     replay(Session::with_device(recording, gpu, &args.out).into_diagnostic()?, &args.view, verbosity)
 }

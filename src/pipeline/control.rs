@@ -16,6 +16,7 @@ const PAUSED: u8 = 2;
 pub struct Control {
     stopped: AtomicBool,
     interrupted: AtomicBool,
+    leaving: AtomicBool,
     /// [`GOING`], [`STEPPING`] or [`PAUSED`].
     pace: AtomicU8,
     refining_on: AtomicBool,
@@ -43,6 +44,18 @@ impl Control {
     /// Whether the program is to end.
     pub fn is_interrupted(&self) -> bool {
         self.interrupted.load(Ordering::Relaxed)
+    }
+
+    /// Ends the run after the next keyframe or round, with a checkpoint where it keeps checkpoints.
+    pub fn leave(&self) {
+        self.resume();
+        self.refine_on(false);
+        self.leaving.store(true, Ordering::Relaxed);
+    }
+
+    /// Whether the run is to end at its next checkpoint.
+    pub fn is_leaving(&self) -> bool {
+        self.leaving.load(Ordering::Relaxed)
     }
 
     /// Takes a stop and a pause back, so that the refinement of a finished run can go on.

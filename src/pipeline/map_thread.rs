@@ -151,6 +151,9 @@ impl MapThread<'_> {
         let mut mapper = Mapper::restore(self.gpu.clone(), self.config, &state.mapper).map_err(explained)?;
         let records = state.records();
         while checkpointer.digest().messages < state.digest.messages {
+            if self.progress.control().is_leaving() {
+                self.progress.control().stop();
+            }
             let Ok(message) = self.messages.recv() else { return Err(PipelineError::NotCaughtUp { checkpoint: path }) };
             checkpointer.received(&message);
             if let MapperMessage::Keyframe(keyframe) = message {
@@ -204,7 +207,7 @@ impl MapThread<'_> {
             guarded("mapping", || Ok(attending.attend(mapper)?))?;
             // A keyframe that was cut short differs from that of an unbroken run.
             if report.is_some() && !self.progress.stopped() {
-                checkpoints.finished_one(mapper, None, &summary.keyframes);
+                checkpoints.finished_one(mapper, None, &summary.keyframes, self.progress.control());
             }
         }
         Ok(())

@@ -7,7 +7,7 @@ use std::time::Instant;
 use super::attending::{Attending, OrderRenderer};
 use super::progress::{MappingProgress, guarded};
 use super::run::writable;
-use super::{PipelineError, Progress};
+use super::{Control, PipelineError, Progress};
 use crate::mapping::{FinalRefinement, KeyframeId, Mapper, MapperMessage};
 use crate::run_folder::{Checkpointer, KeyframeRecord, RunResult};
 use crate::splat::{Exposure, GaussianCloud};
@@ -72,7 +72,7 @@ impl Refining<'_> {
             let steps = mapper.step_times().len();
             on_round(Round { mapper, attending, steps });
             if !progress.stopped() {
-                checkpoints.finished_one(mapper, Some(refinement), records);
+                checkpoints.finished_one(mapper, Some(refinement), records, progress.control());
             }
         }
     }
@@ -159,9 +159,22 @@ impl Checkpoints {
         self.checkpointer.iter_mut().for_each(|c| c.received(message));
     }
 
-    /// A keyframe or a round is over.
-    pub fn finished_one(&mut self, mapper: &Mapper, refinement: Option<&FinalRefinement>, records: &[KeyframeRecord]) {
+    /// A keyframe or a round is over. A run that leaves stops here.
+    pub fn finished_one(
+        &mut self,
+        mapper: &Mapper,
+        refinement: Option<&FinalRefinement>,
+        records: &[KeyframeRecord],
+        control: &Control,
+    ) {
+        let leaves = control.is_leaving();
+        if leaves {
+            control.stop();
+        }
         let Some(checkpointer) = &mut self.checkpointer else { return };
+        if leaves {
+            checkpointer.hurry();
+        }
         let began = Instant::now();
         match guarded("mapping", || Ok(checkpointer.finished_one(mapper, refinement, records)?)) {
             Ok(None) => {}

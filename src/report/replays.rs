@@ -2,17 +2,20 @@
 //! part in it.
 
 use std::fmt::Write;
+use std::path::Path;
 
 use plotters::prelude::*;
+use serde::{Deserialize, Serialize};
 
-use super::{names, quoted};
+use super::{ReportError, names, quoted};
+use crate::files::write_atomically;
 
 const PANEL: (u32, u32) = (420, 320);
 /// Panels in a row of the plot.
 const COLUMNS: usize = 3;
 
 /// One replay of a recording.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ReplayRow {
     /// Name of the recording, with the sensor if not all of it was used.
     pub recording: String,
@@ -36,6 +39,11 @@ pub struct ReplayRow {
     pub ate_rmse_m: Option<f64>,
     /// Mean time from frame to frame, milliseconds: decoding, features and tracking, beside each other.
     pub ms_per_frame: f64,
+}
+
+impl ReplayRow {
+    /// Name of a row as a file of its own.
+    pub const FILE: &str = "replay.json";
 }
 
 /// What a variant does on a recording.
@@ -168,6 +176,20 @@ pub fn to_csv(rows: &[ReplayRow]) -> String {
         );
     }
     csv
+}
+
+/// Writes `track.csv`, `track.md` and `track.svg` into a folder; returns the table in Markdown.
+///
+/// # Errors
+/// If the figure cannot be drawn or a file cannot be written.
+pub fn write(folder: &Path, rows: &[ReplayRow]) -> Result<String, ReportError> {
+    let all = distributions(rows);
+    let table = to_markdown(&all);
+    let svg = draw(&all).map_err(ReportError::Drawing)?;
+    for (name, text) in [("track.csv", &to_csv(rows)), ("track.md", &table), ("track.svg", &svg)] {
+        write_atomically(&folder.join(name), text.as_bytes())?;
+    }
+    Ok(table)
 }
 
 /// The distributions, the cost of each variant, and what recordings that are left out cost, as Markdown.

@@ -94,6 +94,11 @@ impl Checkpointer {
         self.digest.update(message);
     }
 
+    /// Makes the next finished keyframe or round one with a checkpoint.
+    pub(crate) fn hurry(&mut self) {
+        self.since = self.every;
+    }
+
     /// Counts a finished keyframe or round, and writes a checkpoint if one is due; returns its size in bytes.
     ///
     /// # Errors
@@ -114,7 +119,7 @@ impl Checkpointer {
 
     /// Counts a finished keyframe or round; whether a checkpoint is due.
     fn is_due(&mut self) -> bool {
-        self.since += 1;
+        self.since = self.since.saturating_add(1);
         let due = self.since >= self.every;
         if due {
             self.since = 0;
@@ -154,6 +159,8 @@ mod tests {
         assert_eq!([1, 2, 3, 7, 8, usize::MAX].map(due), [7, 3, 2, 1, 0, 0]);
         let mut third = checkpointer(3, None);
         assert_eq!([(); 6].map(|()| third.is_due()), [false, false, true, false, false, true]);
+        third.hurry();
+        assert_eq!([(); 3].map(|()| third.is_due()), [true, false, false]);
     }
 
     #[test]

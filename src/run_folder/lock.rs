@@ -24,7 +24,7 @@ impl FolderLock {
     ///
     /// # Errors
     /// If another process has it, or nothing can be written there.
-    pub(crate) fn take(folder: &Path) -> Result<Self, OutputError> {
+    pub fn take(folder: &Path) -> Result<Self, OutputError> {
         let path = folder.join(NAME);
         let open = File::options().write(true).create(true).truncate(false).open(&path);
         let file = open.map_err(|source| OutputError::Folder { path: folder.into(), source })?;
@@ -36,5 +36,11 @@ impl FolderLock {
             Ok(()) => {}
         }
         Ok(Self { _file: file })
+    }
+
+    /// Whether a process holds the folder.
+    pub fn is_held(folder: &Path) -> bool {
+        let file = File::options().write(true).open(folder.join(NAME));
+        file.is_ok_and(|file| matches!(file.try_lock_shared(), Err(TryLockError::WouldBlock)))
     }
 }

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 const EVERYTHING_ABOVE: &[&str] = &["*"];
 
 /// A module, and the modules whose items it may name. `verification` is in no list but the command line's: production does not use the oracle.
-const ALLOWED: [(&str, &[&str]); 26] = [
+const ALLOWED: [(&str, &[&str]); 27] = [
     ("files", &[]),
     ("geometry", &[]),
     ("sequence", &["geometry"]),
@@ -68,6 +68,7 @@ const ALLOWED: [(&str, &[&str]); 26] = [
         ],
     ),
     ("report", &["files", "evaluation", "run_folder", "viewing"]),
+    ("jobs", &["files", "sequence", "evaluation", "run_folder", "report"]),
     (
         "session",
         &[

@@ -11,6 +11,7 @@ mod export;
 mod faults;
 mod film;
 mod interaction;
+mod jobs;
 mod known_poses;
 mod mesh;
 mod quality;

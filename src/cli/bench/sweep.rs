@@ -4,17 +4,17 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 use clap::{Args, ValueEnum};
-use keysplat::evaluation::{Metrics, machine};
+use keysplat::evaluation::Metrics;
 use keysplat::files::write_atomically;
+use keysplat::jobs::{Draft, RunTask, Task, Work};
 use keysplat::presets::Preset;
-use keysplat::report::curves;
-use keysplat::report::sweep::{Sweep, SweepRow, Verdict, compare as changes, points, to_csv, to_markdown, with_spread};
+use keysplat::report::sweep::{self as report, Sweep, SweepRow, Verdict, compare as changes, with_spread};
 use keysplat::run_folder::outputs;
 use keysplat::synthetic::SceneConfig;
 use miette::{IntoDiagnostic, miette};
 
 use super::ablation::{Variant, parse_variant};
-use crate::cli::{Verbosity, generate, print, progress};
+use crate::cli::{Verbosity, generate, jobs, print, progress};
 
 /// Scenes that need no recording.
 const SCENES: [(&str, &str); 3] = [
@@ -33,8 +33,11 @@ pub(super) struct SweepArgs {
     #[arg(required = true)]
     sequences: Vec<String>,
     /// Folder for all runs, sweep.csv, sweep.json, sweep.md and curves.svg; a sweep that was interrupted goes on there.
-    #[arg(short, long)]
-    out: PathBuf,
+    #[arg(short, long, required_unless_present = "plan")]
+    out: Option<PathBuf>,
+    /// Write a plan of tasks into this folder instead, for `keysplat jobs`.
+    #[arg(long, value_name = "FOLDER", conflicts_with = "out")]
+    plan: Option<PathBuf>,
     /// Epochs after the last keyframe: each number is a point of the curves. 4, 8, 17 and 34 if there are no presets either.
     #[arg(long, value_delimiter = ',')]
     epochs: Vec<usize>,
@@ -74,33 +77,39 @@ struct Cell {
 }
 
 pub(super) fn sweep(args: &SweepArgs, verbosity: Verbosity) -> miette::Result<()> {
-    std::fs::create_dir_all(&args.out).into_diagnostic()?;
-    let cells = cells(args, verbosity)?;
+    let folder = args.plan.as_ref().or(args.out.as_ref()).ok_or_else(|| miette!("give a folder with --out or --plan"))?;
+    std::fs::create_dir_all(folder).into_diagnostic()?;
+    let cells = cells(args, folder, verbosity)?;
+    if args.plan.is_some() {
+        return plan(&cells, folder);
+    }
     let bar = progress::bar(verbosity, cells.len() as u64, "{wide_bar} {pos}/{len} runs  {msg}");
-    let (mut rows, mut machine) = (Vec::new(), None);
+    let (mut rows, mut last) = (Vec::new(), None);
     for cell in &cells {
         bar.set_message(format!("{} {} seed {}", cell.sequence, cell.variant, cell.seed));
         let metrics = cell.measure()?;
         rows.push(SweepRow::new(&cell.sequence, &cell.variant, cell.seed, &metrics));
-        machine = Some(metrics);
+        last = Some(metrics);
         bar.inc(1);
     }
     bar.finish_and_clear();
-    let adapter = machine.and_then(|m| m.adapter).map_or_else(String::new, |a| format!("{}, {}", a.name, a.driver));
-    let sweep = Sweep {
-        adapter,
-        cpu: machine::cpu_name(),
-        threads: std::thread::available_parallelism().map_or(1, |n| n.get() as u64),
-        version: env!("CARGO_PKG_VERSION").into(),
-        rows,
-    };
-    let table = to_markdown(&sweep.rows);
-    let svg = curves::draw(&points(&sweep.rows)).map_err(|e| miette!("cannot draw the curves: {e}; please report this"))?;
-    let json = serde_json::to_string_pretty(&sweep).into_diagnostic()?;
-    for (name, text) in [("sweep.json", &json), ("sweep.csv", &to_csv(&sweep.rows)), ("sweep.md", &table), ("curves.svg", &svg)] {
-        write_atomically(&args.out.join(name), text.as_bytes()).into_diagnostic()?;
+    let last = last.ok_or_else(|| miette!("there is nothing to run; give at least one seed"))?;
+    print(&report::write(folder, &Sweep::of(rows, &last, Vec::new())).into_diagnostic()?)
+}
+
+/// Writes the runs as tasks.
+fn plan(cells: &[Cell], folder: &Path) -> miette::Result<()> {
+    let mut draft = Draft::new(folder).into_diagnostic()?;
+    for Cell { sequence, recording, variant, seed, options, .. } in cells {
+        let mut inputs = Vec::new();
+        for path in jobs::inputs_of_run(recording, options)? {
+            inputs.push(draft.input(&path).into_diagnostic()?);
+        }
+        let recording = draft.place(recording).into_diagnostic()?;
+        let run = RunTask { sequence: sequence.clone(), variant: variant.clone(), recording, options: options.clone() };
+        draft.task(Task { name: format!("{sequence}, {variant}, seed {seed}"), seed: *seed, inputs, work: Work::Run(run) });
     }
-    print(&table)
+    jobs::print_plan(&draft.finish().into_diagnostic()?)
 }
 
 /// The runs that each sequence and seed gets, name and options: each variant with each preset and each number of epochs.
@@ -134,15 +143,15 @@ fn settings(args: &SweepArgs) -> Vec<(String, Vec<String>)> {
     settings
 }
 
-fn cells(args: &SweepArgs, verbosity: Verbosity) -> miette::Result<Vec<Cell>> {
+fn cells(args: &SweepArgs, folder: &Path, verbosity: Verbosity) -> miette::Result<Vec<Cell>> {
     let mut cells = Vec::new();
     for sequence in &args.sequences {
-        let (name, recording) = recording(sequence, &args.out, verbosity)?;
+        let (name, recording) = recording(sequence, folder, verbosity)?;
         for (variant, settings) in settings(args) {
             for &seed in &args.seeds {
                 let of_seed = ["--set".into(), format!("mapping.seed={seed}")];
                 let options = args.run.iter().chain(&settings).chain(&of_seed).cloned().collect();
-                let out = args.out.join("runs").join(slug(&name)).join(format!("{}-{seed}", slug(&variant)));
+                let out = folder.join("runs").join(slug(&name)).join(format!("{}-{seed}", slug(&variant)));
                 let (sequence, recording, variant) = (name.clone(), recording.clone(), variant.clone());
                 cells.push(Cell { sequence, recording, variant, seed, options, out });
             }

@@ -1,15 +1,15 @@
 //! `keysplat bench track`
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use clap::{Args, ValueEnum};
 use crossbeam::channel::bounded;
 use keysplat::Config;
 use keysplat::evaluation::{Alignment, evaluate_trajectory};
-use keysplat::files::write_atomically;
 use keysplat::geometry::Trajectory;
-use keysplat::report::replays::{ReplayRow, distributions, draw, to_csv, to_markdown};
+use keysplat::jobs::{Draft, ReplayTask, Task, Work};
+use keysplat::report::replays::{self as report, ReplayRow};
 use keysplat::sequence::{SensorKind, Sequence};
 use keysplat::synthetic::SceneConfig;
 use keysplat::tracking::{FrontEnd, Tracker, TrackingConfig};
@@ -18,7 +18,7 @@ use rayon::iter::{IntoParallelRefIterator, ParallelIterator};
 
 use super::ablation::{Variant, parse_variant};
 use super::sweep::{recording, scene};
-use crate::cli::{Verbosity, generate, print, progress};
+use crate::cli::{Verbosity, generate, jobs, print, progress};
 
 /// Frames extracted ahead.
 const AHEAD: usize = 8;
@@ -32,8 +32,11 @@ pub(super) struct TrackArgs {
     /// Recordings with ground truth, or names of synthetic scenes: demo, room-clean, room-noisy.
     sequences: Vec<String>,
     /// Folder for track.csv, track.md and track.svg.
-    #[arg(short, long)]
-    out: PathBuf,
+    #[arg(short, long, required_unless_present = "plan")]
+    out: Option<PathBuf>,
+    /// Write a plan of tasks into this folder instead, for `keysplat jobs`.
+    #[arg(long, value_name = "FOLDER", conflicts_with = "out")]
+    plan: Option<PathBuf>,
     /// Synthetic rooms of differing furnishing, textures and shake, 150 frames each, beside the recordings; one distribution in all.
     #[arg(long, default_value_t = 0)]
     rooms: u64,
@@ -73,95 +76,126 @@ enum Direction {
     Backwards,
 }
 
+/// A recording that is replayed, or the part of it that one sensor sees.
+struct Source {
+    name: String,
+    path: PathBuf,
+    sensor: Option<SensorKind>,
+    sequence: Sequence,
+}
+
 /// One replay to be made.
 struct Replay<'a> {
     sequence: &'a Sequence,
-    name: &'a str,
-    config: (&'a str, &'a TrackingConfig),
-    start: usize,
-    direction: Direction,
-    every: usize,
-    missing_percent: u32,
-    most: usize,
+    config: &'a TrackingConfig,
+    task: ReplayTask,
 }
 
 pub(super) fn track(args: &TrackArgs, verbosity: Verbosity) -> miette::Result<()> {
-    std::fs::create_dir_all(&args.out).into_diagnostic()?;
-    let recordings = recordings(args, verbosity)?;
+    let folder = args.plan.as_ref().or(args.out.as_ref()).ok_or_else(|| miette!("give a folder with --out or --plan"))?;
+    std::fs::create_dir_all(folder).into_diagnostic()?;
+    let sources = sources(args, folder, verbosity)?;
     let plain = [Variant { name: "default".into(), settings: Vec::new() }];
     let variants = if args.variants.is_empty() { &plain[..] } else { &args.variants };
-    let config = |variant: &Variant| Ok(Config::default().with_settings(&variant.settings).into_diagnostic()?.tracking);
-    let configs = variants.iter().map(config).collect::<miette::Result<Vec<_>>>()?;
-    let configs: Vec<(&str, &TrackingConfig)> = variants.iter().map(|v| v.name.as_str()).zip(&configs).collect();
-    let replays = replays(args, &recordings, &configs);
+    let configs = variants.iter().map(|variant| Ok((variant, config(&variant.settings)?))).collect::<miette::Result<Vec<_>>>()?;
+    let replays = replays(args, &sources, &configs);
+    if args.plan.is_some() {
+        return plan(&replays, folder);
+    }
     let bar = progress::bar(verbosity, replays.len() as u64, "{wide_bar} {pos}/{len} replays  {msg}");
     let pool = rayon::ThreadPoolBuilder::new().num_threads(args.jobs).build().into_diagnostic()?;
     let measure = |replay: &Replay<'_>| {
-        let row = replay.measure();
+        let row = replay.measure(&|| false)?;
         bar.inc(1);
-        row
+        row.ok_or_else(|| miette!("a replay was interrupted"))
     };
     let rows = pool.install(|| replays.par_iter().map(measure).collect::<miette::Result<Vec<ReplayRow>>>())?;
     bar.finish_and_clear();
-    let all = distributions(&rows);
-    let table = to_markdown(&all);
-    let svg = draw(&all).map_err(|error| miette!("cannot draw: {error}; please report this"))?;
-    for (name, text) in [("track.csv", &to_csv(&rows)), ("track.md", &table), ("track.svg", &svg)] {
-        write_atomically(&args.out.join(name), text.as_bytes()).into_diagnostic()?;
+    print(&report::write(folder, &rows).into_diagnostic()?)
+}
+
+/// Writes the replays as tasks.
+fn plan(replays: &[Replay<'_>], folder: &Path) -> miette::Result<()> {
+    let mut draft = Draft::new(folder).into_diagnostic()?;
+    for Replay { task, .. } in replays {
+        let input = draft.input(&task.recording).into_diagnostic()?;
+        let replay = ReplayTask { recording: draft.place(&task.recording).into_diagnostic()?, ..task.clone() };
+        let direction = if task.backwards { "backwards" } else { "forwards" };
+        let ReplayTask { name, variant, start, every, missing_percent, .. } = task;
+        let name = format!("{name}, {variant}, from {start} {direction}, every {every}, {missing_percent}% missing");
+        draft.task(Task { name, seed: *start as u64, inputs: vec![input], work: Work::Replay(replay) });
     }
-    print(&table)
+    jobs::print_plan(&draft.finish().into_diagnostic()?)
+}
+
+/// Replays a task of a plan; `None` if `is_leaving` ended it early.
+pub(in crate::cli) fn replay(task: &ReplayTask, is_leaving: &dyn Fn() -> bool) -> miette::Result<Option<ReplayRow>> {
+    let sequence = open(&task.recording, task.sensor)?;
+    Replay { sequence: &sequence, config: &config(&task.settings)?, task: task.clone() }.measure(is_leaving)
+}
+
+fn config(settings: &[String]) -> miette::Result<TrackingConfig> {
+    Ok(Config::default().with_settings(settings).into_diagnostic()?.tracking)
+}
+
+fn open(folder: &Path, sensor: Option<SensorKind>) -> miette::Result<Sequence> {
+    let mut sequence = Sequence::open(folder, None, None).into_diagnostic()?;
+    if sequence.groundtruth.is_none() {
+        return Err(miette!("{} has no ground truth to compare a trajectory with", folder.display()));
+    }
+    sensor.map_or(Ok(()), |kind| sequence.restrict_to(kind)).into_diagnostic()?;
+    Ok(sequence)
 }
 
 /// The recordings with their names; one for each sensor, where sensors are given.
-fn recordings(args: &TrackArgs, verbosity: Verbosity) -> miette::Result<Vec<(String, Sequence)>> {
+fn sources(args: &TrackArgs, out: &Path, verbosity: Verbosity) -> miette::Result<Vec<Source>> {
     let mut folders = Vec::new();
     for sequence in &args.sequences {
-        folders.push(recording(sequence, &args.out, verbosity)?);
+        folders.push(recording(sequence, out, verbosity)?);
     }
     for seed in (FIRST_ROOM_SEED..).take(args.rooms as usize) {
         let scene = scene(ROOM)?;
-        let folder = args.out.join("recordings").join(format!("{ROOM}-{seed}"));
+        let folder = out.join("recordings").join(format!("{ROOM}-{seed}"));
         generate::render_if_changed(&SceneConfig { seed, frames: ROOM_FRAMES, ..scene }, &folder, verbosity)?;
         folders.push(("rooms".into(), folder));
     }
     if folders.is_empty() {
         return Err(miette!("nothing to replay: give recordings, or --rooms"));
     }
-    let mut recordings = Vec::new();
-    for (name, folder) in folders {
-        let open = || Sequence::open(&folder, None, None).into_diagnostic();
-        let whole = open()?;
-        if whole.groundtruth.is_none() {
-            return Err(miette!("{} has no ground truth to compare a trajectory with", folder.display()));
-        }
-        if args.sensor.is_empty() {
-            recordings.push((name, whole));
-            continue;
-        }
-        for &kind in &args.sensor {
-            let mut restricted = open()?;
-            restricted.restrict_to(kind).into_diagnostic()?;
-            recordings.push((format!("{name} {kind}"), restricted));
+    let sensors: Vec<_> = if args.sensor.is_empty() { vec![None] } else { args.sensor.iter().copied().map(Some).collect() };
+    let mut sources = Vec::new();
+    for (name, path) in folders {
+        for &sensor in &sensors {
+            let name = sensor.map_or_else(|| name.clone(), |kind| format!("{name} {kind}"));
+            sources.push(Source { name, sequence: open(&path, sensor)?, path: path.clone(), sensor });
         }
     }
-    Ok(recordings)
+    Ok(sources)
 }
 
-fn replays<'a>(
-    args: &TrackArgs,
-    recordings: &'a [(String, Sequence)],
-    configs: &[(&'a str, &'a TrackingConfig)],
-) -> Vec<Replay<'a>> {
+fn replays<'a>(args: &TrackArgs, sources: &'a [Source], configs: &'a [(&Variant, TrackingConfig)]) -> Vec<Replay<'a>> {
     let mut replays = Vec::new();
-    for (name, sequence) in recordings {
+    for Source { name, path, sensor, sequence } in sources {
         let directions = args.direction.iter().filter(|d| sequence.has_random_access() || **d == Direction::Forwards);
         for &direction in directions {
             for &every in &args.every {
                 for &missing_percent in &args.missing {
                     for k in 0..args.starts {
-                        let start = k * (sequence.entries.len() / 2) / args.starts;
-                        let most = args.frames.unwrap_or(usize::MAX);
-                        let replay = |&config| Replay { sequence, name, config, start, direction, every, missing_percent, most };
+                        let replay = |(variant, config): &'a (&Variant, TrackingConfig)| {
+                            let task = ReplayTask {
+                                name: name.clone(),
+                                recording: path.clone(),
+                                sensor: *sensor,
+                                variant: variant.name.clone(),
+                                settings: variant.settings.clone(),
+                                start: k * (sequence.entries.len() / 2) / args.starts,
+                                backwards: direction == Direction::Backwards,
+                                every,
+                                missing_percent,
+                                most: args.frames,
+                            };
+                            Replay { sequence, config, task }
+                        };
                         replays.extend(configs.iter().map(replay));
                     }
                 }
@@ -174,16 +208,17 @@ fn replays<'a>(
 impl Replay<'_> {
     /// The frames, in the order of replay. Which are missing depends on the start alone, so that all settings see the same ones.
     fn frames(&self) -> Vec<usize> {
-        let len = self.sequence.entries.len();
-        let place = |i: usize| if self.direction == Direction::Backwards { len - 1 - i } else { i };
-        let mut rng = fastrand::Rng::with_seed(self.start as u64);
-        let chosen = (self.start..len).step_by(self.every).take(self.most);
-        chosen.filter(|_| rng.u32(..100) >= self.missing_percent).map(place).collect()
+        let (len, task) = (self.sequence.entries.len(), &self.task);
+        let place = |i: usize| if task.backwards { len - 1 - i } else { i };
+        let mut rng = fastrand::Rng::with_seed(task.start as u64);
+        let chosen = (task.start..len).step_by(task.every).take(task.most.unwrap_or(usize::MAX));
+        chosen.filter(|_| rng.u32(..100) >= task.missing_percent).map(place).collect()
     }
 
-    fn measure(&self) -> miette::Result<ReplayRow> {
+    /// The row; `None` if `is_leaving` ended the replay early.
+    fn measure(&self, is_leaving: &dyn Fn() -> bool) -> miette::Result<Option<ReplayRow>> {
         let frames = self.frames();
-        let (name, config) = self.config;
+        let config = self.config;
         let mut tracker = Tracker::new(self.sequence.camera, self.sequence.sensor, config).into_diagnostic()?;
         let front_end = FrontEnd::new(self.sequence.camera, self.sequence.sensor, config);
         let started = Instant::now();
@@ -204,11 +239,17 @@ impl Replay<'_> {
                 );
             });
             for frame in extracted {
+                if is_leaving() {
+                    return Ok(());
+                }
                 tracker.track_extracted(&frame.into_diagnostic()?, true).into_diagnostic()?;
             }
             tracker.finish().into_diagnostic()?;
             Ok::<_, miette::Report>(())
         })?;
+        if is_leaving() {
+            return Ok(None);
+        }
         let ms_per_frame = 1e3 * started.elapsed().as_secs_f64() / frames.len().max(1) as f64;
         let mut poses: Vec<_> = tracker.trajectory().into_iter().map(|(_, pose)| pose).collect();
         poses.sort_by(|a, b| a.timestamp_s.total_cmp(&b.timestamp_s));
@@ -216,18 +257,19 @@ impl Replay<'_> {
         let alignment = Alignment::of(self.sequence.sensor.kind());
         let truth = self.sequence.groundtruth.as_ref().expect("checked when it was opened");
         let errors = evaluate_trajectory(truth, &Trajectory { poses }, alignment);
-        Ok(ReplayRow {
-            recording: self.name.into(),
-            variant: name.into(),
-            start: self.start,
-            backwards: self.direction == Direction::Backwards,
-            every: self.every,
-            missing_percent: self.missing_percent,
+        let ReplayTask { name, variant, start, backwards, every, missing_percent, .. } = self.task.clone();
+        Ok(Some(ReplayRow {
+            recording: name,
+            variant,
+            start,
+            backwards,
+            every,
+            missing_percent,
             frames: frames.len(),
             lost,
             keyframes: tracker.keyframe_count(),
             ate_rmse_m: errors.ok().map(|errors| errors.ate_rmse_m),
             ms_per_frame,
-        })
+        }))
     }
 }

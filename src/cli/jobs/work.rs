@@ -1,0 +1,192 @@
+//! The work of each kind of task, and the signals that end it early.
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use clap::Parser;
+use keysplat::jobs::{JobError, Made, Plan, ReplayTask, RunTask, Task, Work, WorkError};
+use keysplat::report::replays::ReplayRow;
+use keysplat::report::sweep::SweepRow;
+use keysplat::run_folder::outputs;
+use keysplat::{Progress, Session, SessionError};
+use miette::IntoDiagnostic;
+
+use crate::cli::Verbosity;
+use crate::cli::bench::track;
+use crate::cli::run::RunArgs;
+
+/// Keyframes, or rounds of a refinement, between two checkpoints.
+const CHECKPOINT_EVERY: usize = 10;
+/// Time for the next checkpoint after a signal; Slurm's leaves a minute.
+const LEAVE_WITHIN: Duration = Duration::from_secs(40);
+
+/// Options of a run, as a command of their own.
+#[derive(Parser)]
+#[command(no_binary_name = true)]
+struct Options {
+    #[command(flatten)]
+    run: RunArgs,
+}
+
+/// The progress of a task, which SIGUSR1, SIGTERM and Ctrl-C end at its next checkpoint.
+pub struct Signals(Progress);
+
+impl Signals {
+    /// Listens from now on.
+    ///
+    /// # Errors
+    /// If the system refuses.
+    pub fn listen() -> Result<Self, JobError> {
+        let progress = Progress::default();
+        listen(progress.clone()).map_err(|reason| JobError::Engine { command: "listening to signals".into(), reason })?;
+        Ok(Self(progress))
+    }
+
+    /// Whether there was a signal.
+    pub fn is_leaving(&self) -> bool {
+        self.0.control().is_leaving()
+    }
+}
+
+#[cfg(unix)]
+fn listen(progress: Progress) -> Result<(), String> {
+    use signal_hook::consts::{SIGINT, SIGTERM, SIGUSR1};
+    let mut signals = signal_hook::iterator::Signals::new([SIGUSR1, SIGTERM, SIGINT]).map_err(|error| error.to_string())?;
+    let leave = move || {
+        // A scheduler may send one signal twice, by way of its shell.
+        if signals.forever().next().is_some() {
+            leave(&progress);
+        }
+    };
+    std::thread::Builder::new().name("signals".into()).spawn(leave).map(drop).map_err(|error| error.to_string())
+}
+
+#[cfg(not(unix))]
+fn listen(progress: Progress) -> Result<(), String> {
+    ctrlc::set_handler(move || leave(&progress)).map_err(|error| error.to_string())
+}
+
+fn leave(progress: &Progress) {
+    tracing::warn!("leaving with a checkpoint");
+    progress.control().leave();
+    std::thread::sleep(LEAVE_WITHIN);
+    progress.control().stop();
+}
+
+fn parse(recording: &Path, out: &Path, options: &[String]) -> miette::Result<RunArgs> {
+    let arguments = [recording.as_os_str(), "--out".as_ref(), out.as_os_str()];
+    let arguments = arguments.into_iter().chain(options.iter().map(AsRef::as_ref));
+    Ok(Options::try_parse_from(arguments).into_diagnostic()?.run)
+}
+
+/// Files that a run with these options reads.
+pub fn inputs_of_run(recording: &Path, options: &[String]) -> miette::Result<Vec<PathBuf>> {
+    parse(recording, Path::new("out"), options)?.inputs()
+}
+
+/// Does the work of a task in a folder.
+pub fn work(plan: &Plan, task: &Task, folder: &Path, signals: &Signals, verbosity: Verbosity) -> Result<Made, WorkError> {
+    if let Err(error) = std::env::set_current_dir(&plan.working_folder) {
+        tracing::warn!("relative paths in options begin at {}: {error}", plan.working_folder.display());
+    }
+    match &task.work {
+        Work::Run(run) => {
+            let recording = plan.folder().join(&run.recording);
+            let replayed = Replayed { run, seed: task.seed, recording: &recording, folder, signals, verbosity };
+            replayed.make()
+        }
+        Work::Replay(replay) => {
+            let recording = plan.folder().join(&replay.recording);
+            write_replay(&ReplayTask { recording, ..replay.clone() }, folder, signals)
+        }
+    }
+}
+
+fn failed(error: impl ToString) -> WorkError {
+    WorkError::Failed(error.to_string())
+}
+
+fn bad_input(error: impl ToString) -> WorkError {
+    WorkError::BadInput(error.to_string())
+}
+
+fn write_replay(task: &ReplayTask, folder: &Path, signals: &Signals) -> Result<Made, WorkError> {
+    let row = track::replay(task, &|| signals.is_leaving()).map_err(bad_input)?.ok_or(WorkError::Interrupted)?;
+    let text = serde_json::to_string(&row).map_err(failed)?;
+    keysplat::files::write_atomically(&folder.join(ReplayRow::FILE), text.as_bytes()).map_err(failed)?;
+    let figures = serde_json::to_value(ReplayRow { ms_per_frame: 0.0, ..row }).map_err(failed)?;
+    Ok(Made { figures, files: Vec::new(), timed_files: vec![ReplayRow::FILE.into()] })
+}
+
+/// A whole run in a task's folder.
+struct Replayed<'a> {
+    run: &'a RunTask,
+    seed: u64,
+    recording: &'a Path,
+    folder: &'a Path,
+    signals: &'a Signals,
+    verbosity: Verbosity,
+}
+
+impl Replayed<'_> {
+    fn make(&self) -> Result<Made, WorkError> {
+        let done = match self.resume() {
+            Ok(Some(done)) => done,
+            Err(error @ (SessionError::Output(_) | SessionError::Gpu(_))) => return Err(failed(error)),
+            nothing => {
+                // Of another adapter, for example: a result is that of one adapter.
+                nothing.err().iter().for_each(|error| tracing::warn!("{error}; the task begins anew"));
+                self.finish(self.begin()?).map_err(of_session)?
+            }
+        };
+        if done { self.made() } else { Err(WorkError::Interrupted) }
+    }
+
+    /// Goes on from a checkpoint, if there is one; whether the run reached its end.
+    fn resume(&self) -> Result<Option<bool>, SessionError> {
+        if !self.folder.join(outputs::CHECKPOINT).exists() {
+            return Ok(None);
+        }
+        match Session::resume(self.folder, Some(self.recording)).and_then(|session| self.finish(session)) {
+            // It stopped before it reached its checkpoint, which stays.
+            Err(_) if self.signals.is_leaving() => Ok(Some(false)),
+            ended => ended.map(Some),
+        }
+    }
+
+    fn begin(&self) -> Result<Session, WorkError> {
+        let mut args = parse(self.recording, self.folder, &self.run.options).map_err(bad_input)?;
+        args = args.calibrated(self.verbosity).map_err(bad_input)?;
+        args.keep_checkpoints(CHECKPOINT_EVERY).map_err(bad_input)?;
+        let (recording, gpu) = args.open().map_err(failed)?;
+        Session::with_device(recording, gpu, self.folder).map_err(of_session)
+    }
+
+    /// Runs to the end and measures; `false` if a signal ended the run early.
+    fn finish(&self, mut session: Session) -> Result<bool, SessionError> {
+        let Signals(progress) = self.signals;
+        let replay = session.run(progress)?;
+        if replay.stopped {
+            return Ok(false);
+        }
+        session.finish(replay, &|_views| ())?;
+        Ok(true)
+    }
+
+    fn made(&self) -> Result<Made, WorkError> {
+        let text = std::fs::read_to_string(self.folder.join(outputs::METRICS)).map_err(failed)?;
+        let metrics = serde_json::from_str(&text).map_err(failed)?;
+        let row = SweepRow::new(&self.run.sequence, &self.run.variant, self.seed, &metrics);
+        let figures = serde_json::to_value(SweepRow { wall_s: 0.0, peak_host_bytes: None, ..row }).map_err(failed)?;
+        let map = outputs::find_map(self.folder).and_then(|(map, _)| Some(map.file_name()?.to_string_lossy().into_owned()));
+        let files = map.into_iter().chain([outputs::TRAJECTORY, outputs::KEYFRAMES].map(String::from)).collect();
+        Ok(Made { figures, files, timed_files: vec![outputs::METRICS.into()] })
+    }
+}
+
+fn of_session(error: SessionError) -> WorkError {
+    match error {
+        SessionError::Recording(_) | SessionError::NothingTracked { .. } => bad_input(error),
+        error => failed(error),
+    }
+}
