@@ -45,7 +45,7 @@ fn backward(i: u32) {
     //# planar
     // A Gaussian's depth at a pixel is z + slope·d. With n = Σ_j share_j·a_j(a_j·p) over its axes, shares falling with the square of the scales:
     let axes = unit_axes(view, unit_rotation);
-    let plane = plane_of(projection, axes);
+    let plane = plane_of(projection, log_scale.xyz, axes);
     let by_slope = vec2(first.w, second.w) / view.intrinsics.xy;
     let p_z = projection.p_in_camera.z;
     by_mean_2d -= plane.slant * p_z / view.intrinsics.xy * color_depth.w;

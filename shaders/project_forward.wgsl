@@ -89,7 +89,7 @@ fn project(i: u32) -> bool {
     projected[PROJECTED * i + 1u] = vec4(conic_factor(projection), seen_opacity);
     projected[PROJECTED * i + 2u] = vec4(seen, bitcast<f32>(pack2x16float(min(half_extent * EXTENT_SLACK, vec2(MAX_EXTENT)))));
     //# planar
-    let plane = plane_of(projection, unit_axes(view, rotation * inverseSqrt(norm_squared)));
+    let plane = plane_of(projection, log_scale.xyz, unit_axes(view, rotation * inverseSqrt(norm_squared)));
     projected[PROJECTED * i + 3u] = vec4(plane.slant * p.z / view.intrinsics.xy, 0.0, 0.0);
     //# end
     return true;

@@ -124,11 +124,11 @@ fn unit_axes(view_: View, unit_rotation: vec4<f32>) -> mat3x3<f32> {
     return mat3x3(rotate_to_camera(view_, axes[0]), rotate_to_camera(view_, axes[1]), rotate_to_camera(view_, axes[2]));
 }
 
-fn plane_of(projection: Projection, axes: mat3x3<f32>) -> Plane {
+fn plane_of(projection: Projection, log_scale: vec3<f32>, axes: mat3x3<f32>) -> Plane {
     var out: Plane;
-    let scale = max(projection.scale, vec3(LEAST_SCALE));
-    let ratios = min(min(scale.x, scale.y), scale.z) / scale;
-    out.shares = ratios * ratios;
+    // Of the squared scales after the smoothing; these may be too small for f32.
+    let log_squares = 2.0 * log_scale - log(projection.kept);
+    out.shares = exp(min(min(log_squares.x, log_squares.y), log_squares.z) - log_squares);
     out.along = projection.p_in_camera * axes;
     out.normal = axes * (out.shares * out.along);
     let p = projection.p_in_camera;

@@ -188,7 +188,6 @@ impl Blending {
 pub fn wgsl_constants(blending: Blending) -> String {
     let form = blending.form;
     let floats = [
-        ("LEAST_SCALE", LEAST_SCALE),
         ("MOST_SLANT", MOST_SLANT),
         ("ALPHA_MIN", ALPHA_MIN),
         ("ALPHA_MAX", ALPHA_MAX),

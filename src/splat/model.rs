@@ -61,8 +61,6 @@ pub enum Surface {
     Planar,
 }
 
-/// Standard deviation below which an axis counts as this thin beside the others, metres.
-pub const LEAST_SCALE: f64 = 1e-15;
 /// Most that depth changes along a plane, in units of what the ray moves sideways: beyond, the plane is seen edge on.
 pub const MOST_SLANT: f64 = 4.0;
 
