@@ -9,57 +9,19 @@ use super::cloud::GpuCloud;
 use super::layout::{
     BlendForm, Blending, COUNTERS, Counter, INTERSECTION_COUNTER, ScanSetup, TileListsSetup, VISIBLE_COUNTER, View,
 };
+use super::rendered::Rendered;
 use super::shaders;
 use super::sort::{Sort, SortJob};
 use super::workspace::{Capacities, Workspace};
 use crate::gpu::{Gpu, GpuBuffer, GpuError, IndirectSize, Kernel, UniformCell, Uniforms, workgroups};
+use crate::splat::ViewCamera;
 use crate::splat::model::Surface;
-use crate::splat::{Exposure, ViewCamera};
 
 /// See [`depth_key`](crate::splat::model::depth_key).
 const DEPTH_KEY_BITS: u32 = 16;
 
 /// Sort keys and values twice, and the Gaussian.
 const INTERSECTION_BYTES: u64 = 20;
-
-/// A rendered view on the host.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Rendered {
-    /// Pixels along x.
-    pub width: u32,
-    /// Pixels along y.
-    pub height: u32,
-    /// `[H, W]` colour over the background, and Σ w z in metres.
-    pub color_depth: Vec<[f32; 4]>,
-    /// `[H, W]` share of light that reaches what lies behind the map; alpha is one minus it.
-    pub transmittance: Vec<f32>,
-    /// `[H, W]` of a planar surface: slopes of the depth along x and y and its square, blended, and the depth behind which less than half of the
-    /// light is left; metres and pixels. Empty otherwise.
-    pub surface: Vec<[f32; 4]>,
-}
-
-impl Rendered {
-    /// Share of the pixel `i` that the map covers.
-    pub fn alpha(&self, i: usize) -> f32 {
-        1.0 - self.transmittance[i]
-    }
-
-    /// Becomes what a camera of this exposure records of it.
-    pub fn expose(&mut self, exposure: &Exposure) {
-        let [r, g, b] = exposure.gains().to_array();
-        self.color_depth.iter_mut().for_each(|p| *p = [p[0] * r, p[1] * g, p[2] * b, p[3]]);
-    }
-
-    /// Expected depth of what was blended at pixel `i`, metres; 0 where nothing was.
-    pub fn expected_depth(&self, i: usize) -> f32 {
-        if self.alpha(i) > 0.0 { self.color_depth[i][3] / self.alpha(i) } else { 0.0 }
-    }
-
-    /// Depth behind which less than half of the light is left at pixel `i`, metres; 0 where more than that passes. Only of a planar surface.
-    pub fn median_depth(&self, i: usize) -> f32 {
-        if self.transmittance[i] < 0.5 { self.surface[i][3] } else { 0.0 }
-    }
-}
 
 /// Counts of a rendered view.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]

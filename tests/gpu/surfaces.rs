@@ -84,6 +84,8 @@ fn flat_gaussians_have_the_depth_of_their_plane() {
             for depth in [rendered.expected_depth(i), rendered.median_depth(i)] {
                 assert!((f64::from(depth) / truth - 1.0).abs() < 0.02, "pixel {pixel}: {depth} is not {truth}");
             }
+            let found = rendered.normal(i, &p).unwrap();
+            assert!(found.dot(&normal) < -0.99, "pixel {pixel:?}: {found:?} is not {normal:?} turned round");
             let slopes = [0, 1].map(|c| f64::from(rendered.surface[i][c] / rendered.alpha(i)));
             let slant = -normal.xy() / normal.dot(&ray) * truth;
             let off = [slopes[0] * p.fx - slant.x, slopes[1] * p.fy - slant.y];
