@@ -24,7 +24,7 @@ pub struct PlanarConfig {
 
 impl Default for PlanarConfig {
     fn default() -> Self {
-        Self { normal_weight: 0.02, spread_weight: 0.5, thickness: 0.1 }
+        Self { normal_weight: 0.01, spread_weight: 2.0, thickness: 0.3 }
     }
 }
 
