@@ -27,16 +27,17 @@ use crate::geometry::Se3;
 use crate::splat::GaussianCloud;
 
 /// All formats; the first one is the default, and the last ones are only read.
-static FORMATS: [MapFormat; 6] = [
+static FORMATS: [MapFormat; 7] = [
     MapFormat(&ply::FORMAT),
     MapFormat(&spz::FORMAT),
     MapFormat(&sog::FORMAT),
     MapFormat(&glb::FORMAT),
     MapFormat(&spz4::FORMAT),
+    MapFormat(&sog::COMPACT_FORMAT),
     MapFormat(&splat::FORMAT),
 ];
 /// Number of formats that are written: the first ones of [`FORMATS`].
-const WRITTEN: usize = 5;
+const WRITTEN: usize = 6;
 
 /// Encodes a map for cameras at these poses, world from camera, which may be none.
 type Encoder = fn(&GaussianCloud, &[Se3]) -> Result<Vec<u8>, ExportError>;

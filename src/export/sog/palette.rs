@@ -8,17 +8,15 @@ use nalgebra::Cholesky;
 use rayon::prelude::*;
 
 use super::super::harmonics::{Coefficients, MOST, Normal, Seen, channel};
+use super::Precision;
 use super::kmeans::{Centroids, Points, kmeans};
 use crate::geometry::Se3;
 use crate::splat::{GaussianCloud, opacity_from_raw};
 
-/// Gaussians that share an entry, on average: an entry costs about as many bytes as so many labels.
-const GAUSSIANS_PER_ENTRY: f64 = 5.5;
 /// Labels have 16 bits.
 pub(super) const MOST_ENTRIES: usize = 1 << 16;
-/// Weight of harmonics themselves beside the colours in a view: they are smaller then where nobody looks. Much to find like ones, and
-/// little once entries are chosen.
-const RIDGES: (f64, f64) = (1e-3, 1e-4);
+/// Weight of harmonics themselves beside the colours in a view to find like ones: more than once entries are chosen.
+const RIDGE_TO_FIND: f64 = 1e-3;
 /// Entries among which the one of the least change is chosen.
 const CANDIDATES: usize = 48;
 const ROUNDS: usize = 4;
@@ -33,10 +31,10 @@ pub(super) struct Palette {
 
 impl Palette {
     /// The palette of a map whose harmonics go beyond the constant one.
-    pub fn new(cloud: &GaussianCloud, cameras: &[Se3]) -> Self {
+    pub fn new(cloud: &GaussianCloud, cameras: &[Se3], precision: &Precision) -> Self {
         let dimensions = 3 * (cloud.sh_degree.coefficients() - 1);
-        let wanted = ((cloud.len() as f64 / GAUSSIANS_PER_ENTRY) as usize).next_multiple_of(64).min(MOST_ENTRIES);
-        let values = quiet(cloud, cameras, RIDGES.0);
+        let wanted = ((cloud.len() as f64 / precision.gaussians_per_entry) as usize).next_multiple_of(64).min(MOST_ENTRIES);
+        let values = quiet(cloud, cameras, RIDGE_TO_FIND);
         if cloud.len() <= wanted {
             return Self { entries: values, labels: (0..cloud.len()).map(|i| i as u16).collect() };
         }
@@ -48,8 +46,8 @@ impl Palette {
         groups.labels.iter().enumerate().for_each(|(i, group)| members[*group].push(i));
         let errors: Vec<f64> = members.iter().map(|group| group.iter().map(|i| f64::from(groups.errors[*i])).sum()).collect();
         let all = errors.iter().sum::<f64>().max(f64::MIN_POSITIVE);
-        let exact = quiet(cloud, cameras, RIDGES.1);
-        let shown = Shown { cloud, cameras, values: &exact };
+        let exact = quiet(cloud, cameras, precision.ridge);
+        let shown = Shown { cloud, cameras, values: &exact, ridge: precision.ridge };
         let share = |(group, error): (&Vec<usize>, &f64)| {
             let entries = (error / all * (wanted - wanted.isqrt()) as f64) as usize;
             let entries = entries.min(group.len()) + 1;
@@ -90,6 +88,8 @@ struct Shown<'a> {
     cameras: &'a [Se3],
     /// `[N, 3 (K − 1)]`, the harmonics that entries stand for.
     values: &'a [f32],
+    /// See [`Precision`].
+    ridge: f64,
 }
 
 /// The root of what a Gaussian's squared error is worth: its opacity, and the root of the share of the images that it fills.
@@ -128,13 +128,13 @@ fn within(normal: Normal, count: usize) -> Normal {
 }
 
 /// How much a change of harmonics shows once the constant one makes up for what it can.
-fn visible(seen: &Seen, count: usize) -> Normal {
+fn visible(seen: &Seen, count: usize, ridge: f64) -> Normal {
     let normal = seen.normal();
     let first = normal.column(0) / normal[(0, 0)].max(1e-9);
     let left = normal - first * normal.row(0);
     Normal::from_fn(|i, k| {
         let inside = (1..count).contains(&i) && (1..count).contains(&k);
-        let ridge = f64::from(u8::from(i == k)) * if (1..count).contains(&i) { RIDGES.1 } else { 1.0 };
+        let ridge = f64::from(u8::from(i == k)) * if (1..count).contains(&i) { ridge } else { 1.0 };
         if inside { left[(i, k)] + ridge } else { ridge }
     })
 }
@@ -152,7 +152,7 @@ fn refined(points: &Points<'_>, shown: &Shown<'_>, members: &[usize], entries: u
         let mut sums = vec![(Normal::zeros(), [Coefficients::zeros(); 3]); centroids.len() / points.dimensions];
         for (member, label) in members.iter().zip(&mut labels) {
             let point = &shown.values[member * points.dimensions..(member + 1) * points.dimensions];
-            let metric = visible(&Seen::new(shown.cloud.means[*member], shown.cameras), count);
+            let metric = visible(&Seen::new(shown.cloud.means[*member], shown.cameras), count, shown.ridge);
             let change = |entry: usize| {
                 let at = &centroids[entry * points.dimensions..(entry + 1) * points.dimensions];
                 (0..3).map(|c| quadratic(&metric, &(rest(at, c) - rest(point, c)), count)).sum::<f64>()
@@ -193,6 +193,7 @@ fn quadratic(metric: &Normal, change: &Coefficients, count: usize) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::super::super::tests::cloud;
+    use super::super::COMPACT;
     use super::*;
     use crate::splat::ShDegree;
 
@@ -205,7 +206,7 @@ mod tests {
         for i in 0..map.len() {
             (1..4).for_each(|k| map.sh[4 * i + k] = map.sh[4 * i + k] * 0.01 + glam::Vec3::splat(kinds[i % 3][k - 1]));
         }
-        let palette = Palette::new(&map, &cameras);
+        let palette = Palette::new(&map, &cameras, &COMPACT);
         let entries = palette.entries.len() / 9;
         assert!((3..=832).contains(&entries), "{entries}");
         for i in 0..map.len() {
@@ -216,11 +217,11 @@ mod tests {
                 let wanted = channel(&map.sh[4 * i..4 * i + 4], c);
                 let mut found = rest(entry, c);
                 found[0] = seen.constant(&wanted, &found);
-                worst = worst.max(quadratic(&visible(&seen, 4), &(found - wanted), 4));
+                worst = worst.max(quadratic(&visible(&seen, 4, COMPACT.ridge), &(found - wanted), 4));
             }
             assert!(worst < 2e-4, "{i}: {worst}");
         }
-        let again = Palette::new(&map, &cameras);
+        let again = Palette::new(&map, &cameras, &COMPACT);
         assert!(again.entries == palette.entries && again.labels == palette.labels);
     }
 }

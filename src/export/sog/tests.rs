@@ -34,18 +34,18 @@ fn with(bytes: &[u8], change: impl Fn(&mut serde_json::Value), image: Option<(&s
 fn the_same_map_gives_the_same_bytes_and_another_order_does_not_matter() {
     let map = cloud(ShDegree::ALL[2], 500);
     let cameras: Vec<Se3> = (0..5).map(|k| Se3::translation(0.2 * f64::from(k), 0.0, -12.0)).collect();
-    let bytes = write::encode(&map, &cameras).unwrap();
-    assert!(write::encode(&map, &cameras).unwrap() == bytes);
+    let bytes = write::encode(&map, &cameras, &COMPACT).unwrap();
+    assert!(write::encode(&map, &cameras, &COMPACT).unwrap() == bytes);
     let one_thread = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
-    assert!(one_thread.install(|| write::encode(&map, &cameras)).unwrap() == bytes, "on any number of threads");
+    assert!(one_thread.install(|| write::encode(&map, &cameras, &COMPACT)).unwrap() == bytes, "on any number of threads");
     let mut turned = GaussianCloud::new(map.sh_degree);
     (0..map.len()).rev().for_each(|i| turned.push(map.get(i)));
-    assert!(write::encode(&turned, &cameras).unwrap() == bytes);
+    assert!(write::encode(&turned, &cameras, &COMPACT).unwrap() == bytes);
 }
 
 #[test]
 fn lies_are_refused() {
-    let bytes = write::encode(&cloud(ShDegree::ALL[1], 100), &[]).unwrap();
+    let bytes = write::encode(&cloud(ShDegree::ALL[1], 100), &[], &COMPACT).unwrap();
     assert_eq!(read(&with(&bytes, |_| (), None)).unwrap(), read(&bytes).unwrap());
     let refusal = |bytes: &[u8]| read(bytes).unwrap_err().to_string();
     let lie = |at: &str, value: serde_json::Value| {
@@ -79,10 +79,10 @@ fn lies_are_refused() {
 fn an_empty_map_and_one_gaussian_are_files_too() {
     for degree in ShDegree::ALL {
         let empty = GaussianCloud::new(degree);
-        assert!(read(&write::encode(&empty, &[]).unwrap()).unwrap().is_empty());
-        assert_eq!(read(&write::encode(&cloud(degree, 1), &[]).unwrap()).unwrap().len(), 1);
+        assert!(read(&write::encode(&empty, &[], &COMPACT).unwrap()).unwrap().is_empty());
+        assert_eq!(read(&write::encode(&cloud(degree, 1), &[], &COMPACT).unwrap()).unwrap().len(), 1);
     }
     let mut map = cloud(ShDegree::default(), 3);
     map.means[1].y = f32::NAN;
-    assert!(matches!(write::encode(&map, &[]), Err(ExportError::NonFinite { index: 1 })));
+    assert!(matches!(write::encode(&map, &[], &COMPACT), Err(ExportError::NonFinite { index: 1 })));
 }

@@ -6,26 +6,19 @@ use rayon::prelude::*;
 use super::bundle::{Plane, Writer};
 use super::codebook::Codebook;
 use super::palette::Palette as Found;
-use super::{Coded, ENTRIES_A_ROW, Files, LARGEST, META, MOST_CODE, Means, Meta, Palette, VERSION, compressed};
+use super::{Coded, ENTRIES_A_ROW, Files, LARGEST, META, MOST_CODE, Means, Meta, Palette, Precision, VERSION, compressed};
 use crate::export::ExportError;
 use crate::export::harmonics::{Seen, channel};
 use crate::geometry::Se3;
 use crate::splat::{GaussianCloud, opacity_from_raw, unit_rotation};
 
-/// Steps of the logarithms of sizes, of constant harmonics and of others: a twentieth of a size or less, half a percent of white, and less
-/// than a palette changes.
-const SCALE_STEP: f32 = 1.0 / 12.0;
-const CONSTANT_STEP: f32 = 0.025;
-const HARMONIC_STEP: f32 = 1.0 / 16.0;
-/// Positions are rounded to this share of the median of the Gaussians' least extents, or finer.
-const STEP: f64 = 1.0 / 8.0;
 /// Sides of WebP images are at most 16,383, and ours multiples of four.
 const MOST_GAUSSIANS: usize = 16_380 * 16_380;
 /// Harmonics beyond are cut off: their squares and sums stay finite.
 const MOST_HARMONIC: f32 = 1e4;
 
 /// The whole file, for cameras at these poses (world from camera), which may be none.
-pub(super) fn encode(cloud: &GaussianCloud, cameras: &[Se3]) -> Result<Vec<u8>, ExportError> {
+pub(super) fn encode(cloud: &GaussianCloud, cameras: &[Se3], precision: &Precision) -> Result<Vec<u8>, ExportError> {
     if let Some(index) = cloud.first_non_finite() {
         return Err(ExportError::NonFinite { index });
     }
@@ -34,17 +27,18 @@ pub(super) fn encode(cloud: &GaussianCloud, cameras: &[Se3]) -> Result<Vec<u8>, 
     }
     let mut sorted = cloud.emptied();
     super::morton::image_order(&cloud.means, Plane::width(cloud.len())).into_iter().for_each(|i| sorted.push(cloud.get(i)));
-    bundle(sorted, cameras).map_err(|reason| ExportError::Encode { reason })
+    bundle(sorted, cameras, precision).map_err(|reason| ExportError::Encode { reason })
 }
 
-fn bundle(mut cloud: GaussianCloud, cameras: &[Se3]) -> Result<Vec<u8>, String> {
+fn bundle(mut cloud: GaussianCloud, cameras: &[Se3], precision: &Precision) -> Result<Vec<u8>, String> {
     cloud.sh.iter_mut().for_each(|c| *c = c.clamp(Vec3::splat(-MOST_HARMONIC), Vec3::splat(MOST_HARMONIC)));
     let mut zip = Writer::new();
-    let harmonics = if cloud.sh_degree.get() > 0 { Some(write_harmonics(&mut zip, &mut cloud, cameras)?) } else { None };
+    let has_harmonics = cloud.sh_degree.get() > 0;
+    let harmonics = if has_harmonics { Some(write_harmonics(&mut zip, &mut cloud, cameras, precision)?) } else { None };
     let count = cloud.len();
-    let means = write_means(&mut zip, &cloud)?;
+    let means = write_means(&mut zip, &cloud, precision.position_step)?;
     zip.add_plane("quats.webp", &Plane::of(count, |i| smallest_three(cloud.rotations[i])))?;
-    let scales = Codebook::new(cloud.log_scales.iter().flat_map(|scale| scale.to_array()), SCALE_STEP);
+    let scales = Codebook::new(cloud.log_scales.iter().flat_map(|scale| scale.to_array()), precision.scale_step);
     let coded = |codebook: &Codebook, values: Vec3, last: u8| {
         let [r, g, b] = values.to_array().map(|value| codebook.place(value));
         [r, g, b, last]
@@ -52,7 +46,7 @@ fn bundle(mut cloud: GaussianCloud, cameras: &[Se3]) -> Result<Vec<u8>, String> 
     zip.add_plane("scales.webp", &Plane::of(count, |i| coded(&scales, cloud.log_scales[i], 255)))?;
     let coefficients = cloud.sh_degree.coefficients();
     let constants: Vec<Vec3> = cloud.sh.chunks(coefficients).map(|sh| sh[0]).collect();
-    let colors = Codebook::new(constants.iter().flat_map(|constant| constant.to_array()), CONSTANT_STEP);
+    let colors = Codebook::new(constants.iter().flat_map(|constant| constant.to_array()), precision.constant_step);
     let opacity = |i: usize| (opacity_from_raw(cloud.raw_opacities[i]) * 255.0).round() as u8;
     zip.add_plane("sh0.webp", &Plane::of(count, |i| coded(&colors, constants[i], opacity(i))))?;
     let meta = Meta {
@@ -76,7 +70,7 @@ fn median_extent(cloud: &GaussianCloud) -> f64 {
     if least.is_empty() { 0.0 } else { f64::from(*least.select_nth_unstable_by(middle, f32::total_cmp).1).exp() }
 }
 
-fn write_means(zip: &mut Writer, cloud: &GaussianCloud) -> Result<Means, String> {
+fn write_means(zip: &mut Writer, cloud: &GaussianCloud, position_step: f64) -> Result<Means, String> {
     let means = &cloud.means;
     let logs: Vec<[f64; 3]> = means.iter().map(|mean| mean.to_array().map(|v| compressed(f64::from(v)))).collect();
     let bound = |k: usize, pick: fn(f64, f64) -> f64| logs.iter().map(|log| log[k]).reduce(pick).unwrap_or(0.0);
@@ -87,7 +81,7 @@ fn write_means(zip: &mut Writer, cloud: &GaussianCloud) -> Result<Means, String>
             let span = maxs[k] - mins[k];
             // Steps grow with the distance from the origin.
             let step = span / MOST_CODE * (1.0 + f64::from(cloud.means[i][k].abs()));
-            let steps = (STEP * extent / step).clamp(1.0, 256.0).log2().floor().exp2();
+            let steps = (position_step * extent / step).clamp(1.0, 256.0).log2().floor().exp2();
             let code = ((logs[i][k] - mins[k]) / span * MOST_CODE / steps).round() * steps;
             if span > 0.0 { code.min(MOST_CODE) as u16 } else { 0 }
         })
@@ -116,11 +110,16 @@ fn smallest_three(rotation: Quat) -> [u8; 4] {
 }
 
 /// Writes the palette and its labels. The constant harmonics then make up for what the palette changes in the cameras' views.
-fn write_harmonics(zip: &mut Writer, cloud: &mut GaussianCloud, cameras: &[Se3]) -> Result<Palette, String> {
-    let found = Found::new(cloud, cameras);
+fn write_harmonics(
+    zip: &mut Writer,
+    cloud: &mut GaussianCloud,
+    cameras: &[Se3],
+    precision: &Precision,
+) -> Result<Palette, String> {
+    let found = Found::new(cloud, cameras, precision);
     let coefficients = cloud.sh_degree.coefficients();
     let dimensions = 3 * (coefficients - 1);
-    let codebook = Codebook::new(found.entries.iter().copied(), HARMONIC_STEP);
+    let codebook = Codebook::new(found.entries.iter().copied(), precision.harmonic_step);
     let entries: Vec<f32> = found.entries.iter().map(|value| codebook.nearest(*value)).collect();
     let means = &cloud.means;
     cloud.sh.par_chunks_mut(coefficients).enumerate().for_each(|(i, sh)| {
