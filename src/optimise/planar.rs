@@ -10,7 +10,7 @@ const LEAST_ALPHA: f32 = 0.5;
 const EDGE: f32 = 0.05;
 
 /// Weights of a planar surface, used where `mapping.surface` is `planar` (2DGS, Huang et al. 2024; PGSR, Chen et al. 2024). They rise linearly
-/// over the final refinement: surfaces that do not exist yet have no normals.
+/// over the final refinement: surfaces that do not exist yet have no normals. Reported losses leave these terms out.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct PlanarConfig {

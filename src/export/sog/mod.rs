@@ -66,9 +66,9 @@ const COMPACT: Precision = Precision {
     scale_step: 1.0 / 12.0,
     constant_step: 0.025,
     harmonic_step: 1.0 / 16.0,
-    position_step: 1.0 / 8.0,
-    gaussians_per_entry: 5.5,
-    ridge: 1e-4,
+    position_step: 1.0 / 12.0,
+    gaussians_per_entry: 7.0,
+    ridge: 1e-5,
 };
 
 const VERSION: u32 = 2;
