@@ -1,5 +1,5 @@
-// Adds to the image's gradients what a planar surface is asked for beside the image: that its normals are those of its depth (2DGS, Huang et al. 2024), and
-// that what is blended into a pixel lies at one depth.
+// Adds the terms of a planar surface to the image's gradients: its normals are those of its depth (2DGS, Huang et al. 2024), and what is blended into a pixel
+// lies at one depth.
 //
 // L = λ_n·(1 - cos(n, N)) + λ_d·(Q·A/S² - 1), means over the pixels. A pixel's plane has the normal n ∝ (-f·g, z + r·f·g), r its ray, g the slope of its depth z:
 // n that of the blended slopes, N that of the depths of the pixels beside it. S = Σ w z, Q = Σ w z², A = Σ w: the spread's term is a variance over a square.
@@ -23,7 +23,7 @@ struct SurfaceSetup {
 // [3, H, W], see `tile_backward`.
 @group(0) @binding(4) var<storage, read_write> image_gradients: array<vec4<f32>>;
 
-// What the normals' term is moved by.
+// Gradient of the normals' term.
 struct NormalGradient {
     // By the slopes' sums, and by S, through the blended normal.
     by_slopes: vec2<f32>,

@@ -15,8 +15,7 @@ const BUSY_WAIT: Duration = Duration::from_secs(1);
 const LOOK_EVERY: Duration = Duration::from_millis(50);
 
 /// Runs the given tasks, at most `processes` at the same time, each by `program jobs run`. A task that ends with status 75 or by a signal goes
-/// on; no failure ends another task. `is_stopped` makes processes leave with a
-/// checkpoint, and keeps others from starting. `on_end` receives the number of each task that is over.
+/// on; no failure ends another task. `is_stopped` makes processes leave with a checkpoint, and keeps others from starting. `on_end` receives the number of each task that is over.
 ///
 /// # Errors
 /// If a process cannot be started.
@@ -55,15 +54,15 @@ pub fn run_all(
     })
 }
 
-/// Exit status of a process; `None` if a signal ended it. A process is asked to leave once this is stopped.
+/// Exit status of a process; `None` if a signal ended it. Once this is stopped, the process receives SIGTERM.
 fn wait(child: &mut Child, is_stopped: &dyn Fn() -> bool) -> std::io::Result<Option<i32>> {
-    let mut asked = false;
+    let mut is_leaving = false;
     loop {
         if let Some(status) = child.try_wait()? {
             return Ok(status.code());
         }
-        if !asked && is_stopped() {
-            asked = true;
+        if !is_leaving && is_stopped() {
+            is_leaving = true;
             leave(child)?;
         }
         std::thread::sleep(LOOK_EVERY);

@@ -41,7 +41,7 @@ pub struct Made {
 /// Why a task's work ended without a result.
 #[derive(Debug)]
 pub enum WorkError {
-    /// It was asked to leave, and left a checkpoint.
+    /// A signal ended it, after a checkpoint.
     Interrupted,
     /// Its input cannot be used: it fails each time.
     BadInput(String),

@@ -1,4 +1,4 @@
-//! What moves a planar surface beside the image.
+//! Loss of a planar surface beside that of the image.
 
 use serde::{Deserialize, Serialize};
 
