@@ -32,9 +32,8 @@ use super::{DensityConfig, InsertionConfig, Keyframe, KeyframeId, MappingConfig,
 use crate::geometry::Se3;
 use crate::gpu::Gpu;
 use crate::optimise::{AdamConfig, DensityPasses, OverScores, Survey, SurveyRules, Trainer, TrainingView};
-use crate::render::{BlendForm, Blending, GpuCloud, Rendered};
+use crate::render::{Blending, GpuCloud, Rendered};
 use crate::sequence::RectifiedImage;
-use crate::splat::model::Surface;
 use crate::splat::{Exposure, GaussianCloud, ViewCamera};
 
 /// Gaussians that there is room for at first; the map's buffers grow with it.
@@ -96,9 +95,9 @@ impl Mapper {
     /// # Errors
     /// [`MappingError`] if a buffer does not fit or the device fails.
     pub fn new(gpu: Arc<Gpu>, config: &MappingConfig) -> Result<Self, MappingError> {
-        let blending = Blending { form: BlendForm::of(&gpu), surface: config.surface };
+        let blending = Blending::of(&gpu, config.surface);
         let mut config = config.clone();
-        if config.surface == Surface::Planar {
+        if blending.is_planar() {
             config.insertion.thickness = config.insertion.thickness.min(config.planar.thickness);
         }
         Ok(Self {

@@ -2,7 +2,6 @@
 
 use crate::gpu::Kernel;
 use crate::render::{BlendForm, Rasterizer, shaders};
-use crate::splat::model::Surface;
 
 #[derive(Debug)]
 pub(super) struct Kernels {
@@ -27,7 +26,7 @@ impl Kernels {
             loss_forward: kernel(&shaders::LOSS_FORWARD),
             loss_reduce: kernel(&shaders::LOSS_REDUCE),
             loss_backward: kernel(&shaders::LOSS_BACKWARD),
-            surface_loss: (blending.surface == Surface::Planar).then(|| kernel(&shaders::SURFACE_LOSS)),
+            surface_loss: blending.is_planar().then(|| kernel(&shaders::SURFACE_LOSS)),
             rasterize_backward: kernel(match form {
                 BlendForm::Wide => &shaders::RASTERIZE_BACKWARD_WIDE,
                 BlendForm::Narrow => &shaders::RASTERIZE_BACKWARD_NARROW,

@@ -153,6 +153,16 @@ impl Blending {
         [Surface::Volume, Surface::Planar].into_iter().flat_map(|surface| BlendForm::ALL.map(|form| Self { form, surface }))
     }
 
+    /// The faster form on this adapter, of a surface.
+    pub fn of(gpu: &Gpu, surface: Surface) -> Self {
+        Self { form: BlendForm::of(gpu), surface }
+    }
+
+    /// Whether the surface is planar.
+    pub fn is_planar(self) -> bool {
+        self.surface == Surface::Planar
+    }
+
     /// Vectors of a projected Gaussian.
     pub(crate) fn projected(self) -> u32 {
         match self.surface {

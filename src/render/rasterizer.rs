@@ -87,8 +87,8 @@ impl Rasterizer {
     /// # Errors
     /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn of_surface(gpu: Arc<Gpu>, surface: Surface) -> Result<Self, GpuError> {
-        let form = BlendForm::of(&gpu);
-        Self::with_blending(gpu, Blending { form, surface })
+        let blending = Blending::of(&gpu, surface);
+        Self::with_blending(gpu, blending)
     }
 
     /// With given blending passes.

@@ -7,7 +7,6 @@ use crate::optimise::image_buffers::LOSS_TILE;
 use crate::optimise::loss::{GpuPixels, ssim_phase};
 use crate::render::layout::{Counter, INTERSECTION_COUNTER, LossSetup, VISIBLE_COUNTER};
 use crate::render::{GpuCloud, PreparedView};
-use crate::splat::model::Surface;
 
 /// Uniforms of a step beside its view.
 pub(super) struct StepUniforms {
@@ -39,7 +38,7 @@ impl Trainer {
             green_gain,
             blue_gain,
         };
-        let is_planar = self.rasterizer.blending().surface == Surface::Planar;
+        let is_planar = self.rasterizer.blending().is_planar();
         let uniforms = &mut self.rasterizer.uniforms;
         StepUniforms {
             surface: is_planar.then(|| uniforms.put(&self.planar.setup(view.surface_share / prepared.view.pixels() as f32))),
@@ -91,7 +90,7 @@ impl Trainer {
         prepared: &PreparedView,
         sink: &Sink<'_>,
     ) {
-        let is_planar = self.rasterizer.blending().surface == Surface::Planar;
+        let is_planar = self.rasterizer.blending().is_planar();
         let thickness = is_planar.then_some(self.planar.thickness);
         let adam = match sink {
             Sink::Adam(adam) => Some(self.rasterizer.uniforms.put(&adam.setup(self.steps, thickness))),

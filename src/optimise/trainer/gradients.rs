@@ -5,7 +5,6 @@ use crate::geometry::Pinhole;
 use crate::gpu::{GpuBuffer, GpuError};
 use crate::optimise::{LossConfig, LossTerms, TargetImage};
 use crate::render::GpuCloud;
-use crate::splat::model::Surface;
 use crate::splat::{GaussianCloud, ViewCamera};
 
 /// Gradient of a loss by the map.
@@ -65,7 +64,7 @@ impl Trainer {
         self.images[0].gradients.write(&gpu, 0, &by_image.color_depth);
         let alpha: Vec<[f32; 4]> = by_image.alpha.iter().map(|a| [*a, 0.0, 0.0, 0.0]).collect();
         self.images[0].gradients.write(&gpu, by_image.color_depth.len(), &alpha);
-        if self.rasterizer.blending().surface == Surface::Planar {
+        if self.rasterizer.blending().is_planar() {
             self.images[0].gradients.write(&gpu, 2 * by_image.color_depth.len(), &by_image.surface);
         }
         self.collect(cloud, camera, background, &Objective::Given)

@@ -1,4 +1,4 @@
-//! Loss of a planar surface beside that of the image.
+//! Loss of a planar surface beside that of the image; `shaders/surface_loss.wgsl` evaluates it.
 
 use serde::{Deserialize, Serialize};
 
