@@ -1,26 +1,28 @@
-// Exclusive prefix sum of the counts that the workgroups of 256 leave behind, in one workgroup; publishes the total. The workgroups of the next
-// pass scan within themselves: reduce then scan (Merrill & Garland's two-level form), without any guarantee of forward progress.
-
-struct ScanSetup {
-    // Counter that receives the total.
-    counter: u32,
-}
+// Exclusive prefix sum of the intersections that the workgroups of `tile_lists_*` leave behind, in one workgroup; publishes the total. The workgroups of the next
+// pass scan within themselves: reduce then scan (Merrill & Garland's two-level form), without any guarantee of forward progress. In the wide form, a second workgroup
+// turns the lengths of the tiles' lists into their places.
 
 @group(0) @binding(0) var<uniform> view: View;
-@group(0) @binding(1) var<uniform> setup: ScanSetup;
-@group(0) @binding(2) var<storage, read_write> block_sums: array<u32>;
-@group(0) @binding(3) var<storage, read_write> counters: array<Counter>;
+@group(0) @binding(1) var<storage, read_write> block_sums: array<u32>;
+@group(0) @binding(2) var<storage, read_write> counters: array<Counter>;
+// [tiles / 2] of two tiles: first place of the list, and its length, which becomes the first place as well: `tile_lists_wide` counts from there.
+@group(0) @binding(3) var<storage, read_write> ranges: array<vec4<u32>>;
 
 // Stands for any total that 32 bits may not hold.
 const MOST: u32 = 0xffffffffu;
 
 @compute @workgroup_size(256)
-fn main(@builtin(local_invocation_index) local: u32) {
-    let is_visible = setup.counter == VISIBLE_COUNTER;
-    let elements = select(counters[VISIBLE_COUNTER].count, view.gaussian_count, is_visible);
-    let capacity = select(view.intersection_capacity, view.gaussian_count, is_visible);
+fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_index) local: u32) {
+    if workgroup.x == 0u {
+        scan_blocks(local);
+    } else {
+        scan_tiles(local);
+    }
+}
+
+fn scan_blocks(local: u32) {
     // The length never decides; see `coefficient_count`.
-    let blocks = min((elements + 255u) / 256u, arrayLength(&block_sums));
+    let blocks = min((counters[VISIBLE_COUNTER].count + 255u) / 256u, arrayLength(&block_sums));
     let share = (blocks + 255u) / 256u;
     let first = min(local * share, blocks);
     let end = min(first + share, blocks);
@@ -39,11 +41,26 @@ fn main(@builtin(local_invocation_index) local: u32) {
     }
     if local == 255u {
         let needed = select(running, MOST, coarse >= MOST / 256u - 256u);
-        let count = select(needed, 0u, needed > capacity);
-        counters[setup.counter].count = count;
-        counters[setup.counter].needed = needed;
-        counters[setup.counter].per_element = dispatch_of((count + 255u) / 256u);
-        counters[setup.counter].per_block = dispatch_of((count + SORT_BLOCK - 1u) / SORT_BLOCK);
-        counters[setup.counter].per_bucket = dispatch_of(view.tiles_x * view.tiles_y + count / BUCKET + 1u);
+        let count = select(needed, 0u, needed > view.intersection_capacity);
+        counters[INTERSECTION_COUNTER] = counter_of(count, needed, view.tiles_x * view.tiles_y);
+    }
+}
+
+fn scan_tiles(local: u32) {
+    let pairs = min((view.tiles_x * view.tiles_y + 1u) / 2u, arrayLength(&ranges));
+    let share = (pairs + 255u) / 256u;
+    let first = min(local * share, pairs);
+    let end = min(first + share, pairs);
+    var sum = 0u;
+    for (var k = first; k < end; k++) {
+        let lists = ranges[k];
+        sum += lists.y + lists.w;
+    }
+    var running = exclusive_sum(local, sum);
+    for (var k = first; k < end; k++) {
+        let lists = ranges[k];
+        let second = running + lists.y;
+        ranges[k] = vec4(running, running, second, second);
+        running = second + lists.w;
     }
 }

@@ -1,5 +1,8 @@
 // Lists tiles (see `shared/tile_rows`) in the form that suits narrow SIMD units: one invocation a Gaussian.
 
+// [intersections] tile of each, before the tile sort.
+@group(0) @binding(7) var<storage, read_write> tile_keys: array<u32>;
+
 var<workgroup> found_here: atomic<u32>;
 
 @compute @workgroup_size(256)

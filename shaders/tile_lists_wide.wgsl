@@ -1,11 +1,14 @@
 // Lists tiles (see `shared/tile_rows`) in the form that suits wide SIMD units: a workgroup shares out the rows of its 256 Gaussians, then the tiles of these
-// rows, one an invocation. A large Gaussian keeps no lane longer than many small ones do.
+// rows, one an invocation. A large Gaussian keeps no lane longer than many small ones do. Gaussians come in map order; a tile's intersections go to its list as
+// they come, and `sort_tiles` sorts them.
+
+// [tiles] (first place of the list, intersections so far): where it ends, once all are listed.
+@group(0) @binding(7) var<storage, read_write> ranges: array<atomic<u32>>;
 
 // Sums over the workgroup's Gaussians up to and with each: of their rows.
 var<workgroup> row_ends: array<u32, 256>;
 // Tiles of each Gaussian.
 var<workgroup> tiles_found: array<atomic<u32>, 256>;
-var<workgroup> found_here: atomic<u32>;
 // Of 256 rows: tiles up to and with each, the first tile, and the Gaussian.
 var<workgroup> tile_ends: array<u32, 256>;
 var<workgroup> first_tiles: array<u32, 256>;
@@ -23,36 +26,19 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
     }
     row_ends[local] = exclusive_sum(local, rows) + rows;
     atomicStore(&tiles_found[local], 0u);
-    if local == 0u {
-        atomicStore(&found_here, 0u);
-    }
     let all_rows = workgroupUniformLoad(&row_ends[255]);
-    if setup.emit == 0u {
-        for (var item = local; item < all_rows; item += 256u) {
-            let member = owner_of_row(item);
-            let outline = outline_of(order[block * 256u + member]);
-            let found = row_of(outline, outline.first_row + row_within(item, member)).count;
-            atomicAdd(&tiles_found[member], found);
-            atomicAdd(&found_here, found);
-        }
-        workgroupBarrier();
-        if is_there {
-            intersection_counts[rank] = atomicLoad(&tiles_found[local]);
-        }
-        if is_there && local == 0u {
-            block_sums[block] = atomicLoad(&found_here);
-        }
-        return;
-    }
-    let found = select(0u, intersection_counts[rank], is_there);
-    var slot = block_sums[block] + exclusive_sum(local, found);
     let has_room = counters[INTERSECTION_COUNTER].count > 0u;
-    if is_there && has_room {
-        let gaussian = order[rank];
-        intersection_counts[view.capacity + 2u * gaussian] = slot;
-        intersection_counts[view.capacity + 2u * gaussian + 1u] = slot + found;
+    var slot = 0u;
+    if setup.emit == 1u {
+        let found = select(0u, intersection_counts[rank], is_there);
+        slot = block_sums[block];
+        let first = slot + exclusive_sum(local, found);
+        if is_there && has_room {
+            let gaussian = order[rank];
+            intersection_counts[view.capacity + 2u * gaussian] = first;
+            intersection_counts[view.capacity + 2u * gaussian + 1u] = first + found;
+        }
     }
-    slot = block_sums[block];
     for (var start = 0u; start < all_rows; start += 256u) {
         let item = start + local;
         var row = TileRow(0u, 0u);
@@ -63,17 +49,28 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
             row = row_of(outline, outline.first_row + row_within(item, member));
             first_tiles[local] = row.first;
             row_gaussians[local] = gaussian;
+            atomicAdd(&tiles_found[member], row.count);
         }
         tile_ends[local] = exclusive_sum(local, row.count) + row.count;
         let tiles_here = workgroupUniformLoad(&tile_ends[255]);
-        for (var k = local; k < tiles_here && has_room; k += 256u) {
+        for (var k = local; k < tiles_here; k += 256u) {
             let owner = owner_of_tile(k);
-            tile_keys[slot + k] = first_tiles[owner] + k - tiles_before(owner);
-            slots[slot + k] = slot + k;
-            slot_gaussians[slot + k] = row_gaussians[owner];
+            let tile = first_tiles[owner] + k - tiles_before(owner);
+            if setup.emit == 0u {
+                atomicAdd(&ranges[2u * tile + 1u], 1u);
+            } else if has_room {
+                slots[atomicAdd(&ranges[2u * tile + 1u], 1u)] = slot + k;
+                slot_gaussians[slot + k] = row_gaussians[owner];
+            }
         }
         slot += tiles_here;
         workgroupBarrier();
+    }
+    if setup.emit == 0u && is_there {
+        intersection_counts[rank] = atomicLoad(&tiles_found[local]);
+        if local == 0u {
+            block_sums[block] = slot;
+        }
     }
 }
 

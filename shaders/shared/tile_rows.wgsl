@@ -1,4 +1,4 @@
-// The tiles that each visible Gaussian really touches, for `tile_lists_*`, which list them nearest Gaussian first: once to count, once to emit.
+// The tiles that each visible Gaussian really touches, for `tile_lists_*`: once to count, once to emit.
 //
 // A tile is touched where the ellipse of alpha ≥ 1/255 reaches the hull of its pixel centres. In a row of tiles the ellipse spans an interval,
 // which has a closed form. The same pipeline counts and emits, so that both agree.
@@ -13,13 +13,12 @@ struct TileListsSetup {
 @group(0) @binding(2) var<storage, read> counters: array<Counter>;
 @group(0) @binding(3) var<storage, read> order: array<u32>;
 @group(0) @binding(4) var<storage, read> projected: array<vec4<f32>>;
-// [visible] tiles of each Gaussian, nearest first (mode 0); behind them, from `capacity` on, its first slot and that past its last, in map
+// [visible] tiles of each Gaussian, in `order` (mode 0); behind them, from `capacity` on, its first slot and that past its last, in map
 // order (mode 1); and from three times that on, which Gaussians are visible, in map order (`compact_visible`).
 @group(0) @binding(5) var<storage, read_write> intersection_counts: array<u32>;
 // [visible / 256] intersections of each workgroup's Gaussians (mode 0), of those before it (mode 1).
 @group(0) @binding(6) var<storage, read_write> block_sums: array<u32>;
-// [intersections] tile, and the intersection's slot, before the tile sort.
-@group(0) @binding(7) var<storage, read_write> tile_keys: array<u32>;
+// [intersections] slots of the tiles' lists, before they are sorted.
 @group(0) @binding(8) var<storage, read_write> slots: array<u32>;
 // [intersections] Gaussian of each slot.
 @group(0) @binding(9) var<storage, read_write> slot_gaussians: array<u32>;

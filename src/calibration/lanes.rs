@@ -96,12 +96,15 @@ fn list_lanes(form: BlendForm, rows: &[u32], tiles: &[u32]) -> LaneUse {
     }
     for (rows, tiles) in rows.chunks(WORKGROUP as usize).zip(tiles.chunks(WORKGROUP as usize)) {
         let all_rows: u32 = rows.iter().sum();
-        lanes.add_shared(all_rows);
+        // Once to count and once to emit.
         let mut rounds = lanes.add_shared(all_rows);
+        lanes.add_shared(all_rows);
         // A round of rows may end within a Gaussian, whose tiles are then spread over its rows evenly.
         let per_row = f64::from(tiles.iter().sum::<u32>()) / f64::from(all_rows.max(1));
         for first in (0..all_rows).step_by(WORKGROUP as usize) {
-            rounds += lanes.add_shared((f64::from((all_rows - first).min(WORKGROUP)) * per_row).round() as u32);
+            let tiles = (f64::from((all_rows - first).min(WORKGROUP)) * per_row).round() as u32;
+            rounds += lanes.add_shared(tiles);
+            lanes.add_shared(tiles);
         }
         lanes.longest = lanes.longest.max(rounds);
     }

@@ -7,7 +7,7 @@ use super::lanes::{Lanes, count_lanes};
 use crate::gpu::GpuError;
 use crate::optimise::Trainer;
 use crate::render::layout::{TILE_HEIGHT, TILE_WIDTH};
-use crate::render::{GpuCloud, Rasterizer, ViewCounts};
+use crate::render::{GpuCloud, ViewCounts};
 use crate::splat::model::{ALPHA_MAX, TRANSMITTANCE_MIN, ViewCamera};
 
 /// Counted work of one view.
@@ -53,7 +53,7 @@ pub fn count_work(trainer: &mut Trainer, cloud: &GpuCloud, camera: &ViewCamera) 
     let (width, height) = (rendered.width, rendered.height);
     let tiles_x = width.div_ceil(TILE_WIDTH);
     let tiles = tiles_x * height.div_ceil(TILE_HEIGHT);
-    let sorted = Rasterizer::sorted(tiles);
+    let sorted = rasterizer.sorted(tiles);
     let ws = &rasterizer.workspace;
     let ranges: Vec<[u32; 2]> = ws.ranges.read(&gpu, 0, tiles as usize)?;
     let slots: Vec<u32> = ws.slots[sorted].read(&gpu, 0, counts.intersections as usize)?;

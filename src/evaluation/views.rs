@@ -23,7 +23,7 @@ use crate::splat::model::Surface;
 
 /// MonoGS compares every 5th frame.
 const MONOGS_EVERY: usize = 5;
-/// Views decoded and compared side by side.
+/// Views of a batch.
 const BATCH: usize = 8;
 
 /// Which views are compared, and how they count.
@@ -86,24 +86,39 @@ struct ProtocolMeans {
     monogs: ImageMeans,
 }
 
+/// A view's figures in the map's own colours and, where that is corrected, with its exposure.
+#[derive(Clone, Copy)]
+struct Compared {
+    role: ViewRole,
+    own: ViewFigures,
+    exposed: Option<ViewFigures>,
+}
+
+impl Compared {
+    /// Of a held-out view.
+    fn record(&self) -> Option<ViewRecord> {
+        let f = self.exposed.unwrap_or(self.own);
+        let psnr_db = Some(f.psnr).filter(|psnr| psnr.is_finite());
+        self.role.is_held_out.then_some(ViewRecord { frame: self.role.frame, psnr_db, ssim: f.ssim, depth_l1_m: f.depth_l1 })
+    }
+}
+
 impl ProtocolMeans {
-    /// Counts a view in by its figures in the map's own colours and, where that is corrected, with its exposure. Returns the record of a
-    /// held-out view.
-    fn add(&mut self, role: ViewRole, own: ViewFigures, exposed: Option<ViewFigures>) -> Option<ViewRecord> {
+    /// Counts a view in and returns its record.
+    fn add(&mut self, view: Compared) -> Option<ViewRecord> {
+        let Compared { role, own, exposed } = view;
         self.all_frames.add(own.psnr, own.ssim, own.depth_l1);
         if role.frame.is_multiple_of(MONOGS_EVERY) && !role.is_keyframe {
             self.monogs.add(own.psnr_lit, own.ssim, own.depth_l1);
         }
-        if !role.is_held_out {
-            return None;
+        if role.is_held_out {
+            if exposed.is_some() {
+                self.map_colors.add(own.psnr, own.ssim, own.depth_l1);
+            }
+            let f = exposed.unwrap_or(own);
+            self.held_out.add(f.psnr, f.ssim, f.depth_l1);
         }
-        if exposed.is_some() {
-            self.map_colors.add(own.psnr, own.ssim, own.depth_l1);
-        }
-        let f = exposed.unwrap_or(own);
-        self.held_out.add(f.psnr, f.ssim, f.depth_l1);
-        let psnr_db = Some(f.psnr).filter(|psnr| psnr.is_finite());
-        Some(ViewRecord { frame: role.frame, psnr_db, ssim: f.ssim, depth_l1_m: f.depth_l1 })
+        view.record()
     }
 
     fn figures(&self) -> ImageProtocols {
@@ -131,57 +146,83 @@ pub struct ViewSource<'a> {
     pub surface: Surface,
 }
 
-/// Compares all posed views with their renders. Frames that cannot be read or are masked wholly are left out. `on_held_out` receives each held-out view, `on_view`
-/// the number of views done.
+/// A posed frame as the camera recorded it.
+struct RecordedView {
+    frame: usize,
+    world_from_camera: Se3,
+    image: RectifiedImage,
+}
+
+/// Compares all posed views with their renders; returns the means by protocol and the held-out views' records in order. Frames that cannot be read or are masked
+/// wholly are left out. `on_held_out` receives each held-out view, several at a time, `on_view` the number of views done.
 ///
 /// # Errors
 /// If the adapter fails.
 pub fn evaluate_views(
     source: ViewSource<'_>,
     selection: &ViewSelection<'_>,
-    on_held_out: &mut dyn FnMut(ComparedView),
+    on_held_out: &(dyn Fn(&ComparedView) + Sync),
     on_view: &dyn Fn(usize),
-) -> Result<ImageProtocols, GpuError> {
+) -> Result<(ImageProtocols, Vec<ViewRecord>), GpuError> {
     let ViewSource { sequence, map_scale, gpu, cloud, surface } = source;
     let mut rectifiers = Rectifiers::new(map_scale);
     let mut rasterizer = Rasterizer::of_surface(gpu.clone(), surface)?;
     let on_gpu = GpuCloud::of(gpu, cloud)?;
+    let mut load = |poses: &[(usize, Se3)]| load_views(sequence, &mut rectifiers, poses);
+    let mut render = |recorded: Vec<RecordedView>| -> Result<Vec<(RecordedView, Rendered)>, GpuError> {
+        let camera = |v: &RecordedView| ViewCamera { pinhole: v.image.pinhole, camera_from_world: v.world_from_camera.inverse() };
+        recorded.into_iter().map(|view| rasterizer.render(&on_gpu, &camera(&view), [0.0; 3]).map(|r| (view, r))).collect()
+    };
+    let compare = |views: Vec<_>| -> Vec<Compared> {
+        views.into_par_iter().map(|view| compare_view(sequence, selection, view, on_held_out)).collect()
+    };
     let mut means = ProtocolMeans::default();
-    for (batch, poses) in selection.poses.chunks(BATCH).enumerate() {
-        on_view(batch * BATCH);
-        let indices: Vec<usize> = poses.iter().map(|(index, _)| *index).collect();
-        let frames = sequence.load_all(&indices);
-        let rectifiers: Vec<Arc<Rectifier>> = indices.iter().map(|index| rectifiers.of(sequence.camera_of(*index))).collect();
-        let recorded: Vec<Option<RectifiedImage>> = rectifiers
-            .par_iter()
-            .zip(frames)
-            .map(|(rectifier, frame)| Some(rectifier.rectify(&frame.ok()?)).filter(shows_anything))
-            .collect();
-        let mut views = Vec::new();
-        for ((index, world_from_camera), recorded) in poses.iter().zip(recorded) {
-            let Some(recorded) = recorded else { continue };
-            let camera = ViewCamera { pinhole: recorded.pinhole, camera_from_world: world_from_camera.inverse() };
-            views.push((*index, rasterizer.render(&on_gpu, &camera, [0.0; 3])?, recorded));
-        }
-        let exposed = |(index, mut rendered, recorded): (usize, Rendered, RectifiedImage)| {
-            let in_map_colors = compare(&rendered, &recorded);
-            let exposures = Some(selection.exposures).filter(|e| !e.is_empty() && (selection.is_held_out)(index));
-            let exposed = exposures.map(|exposures| {
-                rendered.expose(&exposures.at(sequence.entries[index].timestamp_s));
-                compare(&rendered, &recorded)
-            });
-            (index, rendered, recorded, in_map_colors, exposed)
-        };
-        let views: Vec<_> = views.into_par_iter().map(exposed).collect();
-        for (frame, rendered, recorded, own, exposed) in views {
-            let is_keyframe = selection.keyframes.contains(&frame);
-            let role = ViewRole { frame, is_keyframe, is_held_out: (selection.is_held_out)(frame) };
-            if let Some(figures) = means.add(role, own, exposed) {
-                on_held_out(ComparedView { figures, recorded: recorded.color, rendered: to_rgb8(&rendered) });
-            }
-        }
+    let mut records = Vec::new();
+    let (mut recorded, mut rendered, mut done) = (Vec::new(), Vec::new(), 0);
+    // Three batches at a time: one is decoded, one rendered and one compared. Two rounds without new poses empty the pipeline.
+    for poses in selection.poses.chunks(BATCH).chain([&[] as &[_]; 2]) {
+        let (to_render, to_compare) = (std::mem::take(&mut recorded), std::mem::take(&mut rendered));
+        let ((next, renders), compared) =
+            rayon::join(|| rayon::join(|| load(poses), || render(to_render)), || compare(to_compare));
+        (recorded, rendered) = (next, renders?);
+        done += compared.len();
+        records.extend(compared.into_iter().filter_map(|view| means.add(view)));
+        on_view(done);
     }
-    Ok(means.figures())
+    Ok((means.figures(), records))
+}
+
+fn load_views(sequence: &Sequence, rectifiers: &mut Rectifiers, poses: &[(usize, Se3)]) -> Vec<RecordedView> {
+    let indices: Vec<usize> = poses.iter().map(|(index, _)| *index).collect();
+    let frames = sequence.load_all(&indices);
+    let rectifiers: Vec<Arc<Rectifier>> = indices.iter().map(|index| rectifiers.of(sequence.camera_of(*index))).collect();
+    let rectified = rectifiers.par_iter().zip(frames).zip(poses).filter_map(|((rectifier, frame), (frame_index, pose))| {
+        let image = Some(rectifier.rectify(&frame.ok()?)).filter(shows_anything)?;
+        Some(RecordedView { frame: *frame_index, world_from_camera: *pose, image })
+    });
+    rectified.collect()
+}
+
+fn compare_view(
+    sequence: &Sequence,
+    selection: &ViewSelection<'_>,
+    (recorded, mut rendered): (RecordedView, Rendered),
+    on_held_out: &(dyn Fn(&ComparedView) + Sync),
+) -> Compared {
+    let frame = recorded.frame;
+    let is_held_out = (selection.is_held_out)(frame);
+    let role = ViewRole { frame, is_keyframe: selection.keyframes.contains(&frame), is_held_out };
+    let own = compare(&rendered, &recorded.image);
+    let exposures = Some(selection.exposures).filter(|exposures| !exposures.is_empty() && is_held_out);
+    let exposed = exposures.map(|exposures| {
+        rendered.expose(&exposures.at(sequence.entries[frame].timestamp_s));
+        compare(&rendered, &recorded.image)
+    });
+    let compared = Compared { role, own, exposed };
+    if let Some(figures) = compared.record() {
+        on_held_out(&ComparedView { figures, recorded: recorded.image.color, rendered: to_rgb8(&rendered) });
+    }
+    compared
 }
 
 fn shows_anything(image: &RectifiedImage) -> bool {
@@ -226,13 +267,17 @@ mod tests {
     #[test]
     fn a_view_counts_in_its_protocols() {
         let mut means = ProtocolMeans::default();
-        let role = |frame, is_keyframe, is_held_out| ViewRole { frame, is_keyframe, is_held_out };
-        assert_eq!(means.add(role(0, true, false), figures(10.0), None), None);
-        assert_eq!(means.add(role(5, false, false), figures(20.0), None), None);
-        assert_eq!(means.add(role(6, false, false), figures(30.0), None), None);
+        let view = |frame, is_keyframe, is_held_out, own, exposed: Option<f64>| Compared {
+            role: ViewRole { frame, is_keyframe, is_held_out },
+            own: figures(own),
+            exposed: exposed.map(figures),
+        };
+        assert_eq!(means.add(view(0, true, false, 10.0, None)), None);
+        assert_eq!(means.add(view(5, false, false, 20.0, None)), None);
+        assert_eq!(means.add(view(6, false, false, 30.0, None)), None);
         let record = ViewRecord { frame: 8, psnr_db: Some(50.0), ssim: 0.5, depth_l1_m: None };
-        assert_eq!(means.add(role(8, false, true), figures(40.0), Some(figures(50.0))), Some(record));
-        let equal = means.add(role(16, false, true), figures(f64::INFINITY), None).unwrap();
+        assert_eq!(means.add(view(8, false, true, 40.0, Some(50.0))), Some(record));
+        let equal = means.add(view(16, false, true, f64::INFINITY, None)).unwrap();
         assert_eq!((equal.frame, equal.psnr_db), (16, None));
         let figures = means.figures();
         let of = |f: Option<crate::evaluation::metrics::ImageFigures>| f.map(|f| (f.count, f.psnr_db));

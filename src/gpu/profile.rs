@@ -1,5 +1,6 @@
 //! Times on the GPU: a timestamp before each dispatch, where the adapter can.
 
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, PoisonError};
 
 use super::{Gpu, GpuError};
@@ -11,6 +12,7 @@ const MAX_MARKS: usize = 2048;
 pub(super) struct Profiler {
     queries: wgpu::QuerySet,
     marks: Mutex<Vec<&'static str>>,
+    paused: AtomicBool,
 }
 
 impl Profiler {
@@ -20,18 +22,30 @@ impl Profiler {
     pub(super) fn new(device: &wgpu::Device) -> Self {
         let descriptor =
             wgpu::QuerySetDescriptor { label: Some("profile"), ty: wgpu::QueryType::Timestamp, count: MAX_MARKS as u32 };
-        Self { queries: device.create_query_set(&descriptor), marks: Mutex::default() }
+        Self { queries: device.create_query_set(&descriptor), marks: Mutex::default(), paused: AtomicBool::default() }
     }
 }
 
 impl Gpu {
     /// Notes the time at which `label` begins, and what came before it ends. Costs nothing unless profiling.
     pub fn mark(&self, pass: &mut wgpu::ComputePass<'_>, label: &'static str) {
-        let Some(profiler) = &self.profiler else { return };
+        let Some(profiler) = self.profiler.as_ref().filter(|profiler| !profiler.paused.load(Ordering::Relaxed)) else { return };
         let mut marks = profiler.marks.lock().unwrap_or_else(PoisonError::into_inner);
         if marks.len() < MAX_MARKS {
             pass.write_timestamp(&profiler.queries, marks.len() as u32);
             marks.push(label);
+        }
+    }
+
+    /// Whether marks are recorded at all.
+    pub fn has_profile(&self) -> bool {
+        self.profiler.is_some()
+    }
+
+    /// Whether to leave out the marks from now on: each one drains the adapter between two dispatches that might overlap.
+    pub fn pause_profile(&self, paused: bool) {
+        if let Some(profiler) = &self.profiler {
+            profiler.paused.store(paused, Ordering::Relaxed);
         }
     }
 

@@ -1,4 +1,5 @@
-//! Encodes the forward pass: project, compact, depth sort, tile lists, tile sort, blend.
+//! Encodes the forward pass: project, compact, list and sort, blend. The wide form lists intersections by tile and sorts each list; the narrow
+//! one sorts Gaussians by depth, lists their tiles, and sorts these.
 //!
 //! Nothing is read back in between: counts stay on the GPU and later dispatches take their size from them. When the intersections outgrow
 //! their buffers, the GPU renders nothing and says how many there are; the caller grows the buffers and repeats the step.
@@ -6,9 +7,7 @@
 use std::sync::Arc;
 
 use super::cloud::GpuCloud;
-use super::layout::{
-    BlendForm, Blending, COUNTERS, Counter, INTERSECTION_COUNTER, ScanSetup, TileListsSetup, VISIBLE_COUNTER, View,
-};
+use super::layout::{BlendForm, Blending, COUNTERS, Counter, INTERSECTION_COUNTER, TileListsSetup, VISIBLE_COUNTER, View};
 use super::rendered::Rendered;
 use super::shaders;
 use super::sort::{Sort, SortJob};
@@ -37,11 +36,16 @@ struct Kernels {
     project_forward: Kernel,
     compact_visible: Kernel,
     tile_lists: Kernel,
-    tile_ranges: Kernel,
-    order_tiles: Kernel,
     rasterize_forward: Kernel,
     scan_blocks: Kernel,
-    sort: Sort,
+    ordering: Ordering,
+}
+
+/// What brings intersections into the order of blending.
+#[derive(Debug)]
+enum Ordering {
+    Wide { sort_tiles: Kernel },
+    Narrow { sort: Sort, tile_ranges: Kernel, order_tiles: Kernel },
 }
 
 /// The forward pass with its scratch buffers; the optimiser reads these for the backward pass.
@@ -54,8 +58,6 @@ pub struct Rasterizer {
     most_intersections: usize,
     count_mode: GpuBuffer,
     emit_mode: GpuBuffer,
-    visible_scan: GpuBuffer,
-    intersection_scan: GpuBuffer,
     /// Those of the views and whatever else follows them in the same submission.
     pub(crate) uniforms: Uniforms,
     pub(crate) workspace: Workspace,
@@ -106,22 +108,24 @@ impl Rasterizer {
                 BlendForm::Wide => &shaders::TILE_LISTS_WIDE,
                 BlendForm::Narrow => &shaders::TILE_LISTS_NARROW,
             }),
-            tile_ranges: kernel(&shaders::TILE_RANGES),
-            order_tiles: kernel(&shaders::ORDER_TILES),
             rasterize_forward: kernel(&shaders::RASTERIZE_FORWARD),
             scan_blocks: kernel(&shaders::SCAN_BLOCKS),
-            sort: Sort::new(&gpu)?,
+            ordering: match form {
+                BlendForm::Wide => Ordering::Wide { sort_tiles: kernel(&shaders::SORT_TILES) },
+                BlendForm::Narrow => Ordering::Narrow {
+                    sort: Sort::new(&gpu)?,
+                    tile_ranges: kernel(&shaders::TILE_RANGES),
+                    order_tiles: kernel(&shaders::ORDER_TILES),
+                },
+            },
         };
         gpu.check()?;
-        let scan = |label: &str, counter| GpuBuffer::uniform(&gpu, label, &ScanSetup { counter, pad: [0; 3] });
         Ok(Self {
             blending,
             kernels,
             most_intersections: usize::MAX,
             count_mode: GpuBuffer::uniform(&gpu, "count mode", &TileListsSetup { emit: 0, pad: [0; 3] })?,
             emit_mode: GpuBuffer::uniform(&gpu, "emit mode", &TileListsSetup { emit: 1, pad: [0; 3] })?,
-            visible_scan: scan("visible scan", VISIBLE_COUNTER)?,
-            intersection_scan: scan("intersection scan", INTERSECTION_COUNTER)?,
             uniforms: Uniforms::new(&gpu)?,
             workspace: Workspace::new(&gpu, blending)?,
             gpu,
@@ -189,12 +193,15 @@ impl Rasterizer {
         view.antialiased = f32::from(u8::from(cloud.is_antialiased()));
         view.intersection_capacity = self.workspace.intersection_capacity as u32;
         let uniform = self.uniforms.put(&view);
-        Ok(PreparedView { view, uniform, sorted: Self::sorted(view.tiles()) })
+        Ok(PreparedView { view, uniform, sorted: self.sorted(view.tiles()) })
     }
 
     /// Which of `workspace.slots` holds the sorted intersections of a view of so many tiles.
-    pub(crate) fn sorted(tiles: u32) -> usize {
-        Sort::result_of(tile_bits(tiles))
+    pub(crate) fn sorted(&self, tiles: u32) -> usize {
+        match self.form() {
+            BlendForm::Wide => 0,
+            BlendForm::Narrow => Sort::result_of(tile_bits(tiles)),
+        }
     }
 
     /// What all passes over the sorted tile lists bind.
@@ -233,10 +240,9 @@ impl Rasterizer {
     pub fn encode_forward(&self, pass: &mut wgpu::ComputePass<'_>, parameters: &GpuBuffer, prepared: &PreparedView) {
         let (gpu, ws, k) = (&*self.gpu, &self.workspace, &self.kernels);
         let (view, uniform) = (&prepared.view, self.view(prepared));
-        let per_gaussian = workgroups(view.gaussian_count.div_ceil(256));
+        let per_gaussian = workgroups(view.gaussian_count.div_ceil(256).max(1));
         let project = [(0, uniform), (1, parameters), (2, &ws.projected), (3, &ws.visible), (4, &ws.block_sums)];
         k.project_forward.dispatch(gpu, pass, &project, per_gaussian);
-        self.encode_scan(pass, prepared, &self.visible_scan);
         let compact = [
             (0, uniform),
             (1, &ws.visible),
@@ -245,25 +251,27 @@ impl Rasterizer {
             (4, &ws.depth_keys[0]),
             (5, &ws.order[0]),
             (6, &ws.intersection_counts),
+            (7, &ws.counters),
+            (8, &ws.ranges),
         ];
         k.compact_visible.dispatch(gpu, pass, &compact, per_gaussian);
-        let by_depth = SortJob { keys: &ws.depth_keys, values: &ws.order, counter: VISIBLE_COUNTER, bits: DEPTH_KEY_BITS };
-        k.sort.encode(gpu, pass, ws, &by_depth);
+        if let Ordering::Narrow { sort, .. } = &k.ordering {
+            let by_depth = SortJob { keys: &ws.depth_keys, values: &ws.order, counter: VISIBLE_COUNTER, bits: DEPTH_KEY_BITS };
+            sort.encode(gpu, pass, ws, &by_depth);
+        }
         self.encode_tiles(pass, prepared);
         k.rasterize_forward.dispatch(gpu, pass, &self.lists(prepared), self.form().workgroups(view.tiles()));
     }
 
-    fn encode_scan(&self, pass: &mut wgpu::ComputePass<'_>, prepared: &PreparedView, setup: &GpuBuffer) {
-        let ws = &self.workspace;
-        let bindings = [(0, self.view(prepared)), (1, setup), (2, &ws.block_sums), (3, &ws.counters)];
-        self.kernels.scan_blocks.dispatch(&self.gpu, pass, &bindings, [1, 1, 1]);
-    }
-
-    /// Tile lists: count, offsets, emit, stable sort by tile, ranges; in the narrow form, order.
+    /// Tile lists: count, offsets, emit; then each sorted by depth, or all by tile.
     fn encode_tiles(&self, pass: &mut wgpu::ComputePass<'_>, prepared: &PreparedView) {
         let (gpu, ws, k) = (&*self.gpu, &self.workspace, &self.kernels);
         let (view, tiles) = (self.view(prepared), prepared.view.tiles());
         let visible = IndirectSize { buffer: &ws.counters, offset: Counter::per_element_offset(VISIBLE_COUNTER) };
+        let lists_key = match &k.ordering {
+            Ordering::Wide { .. } => &ws.ranges,
+            Ordering::Narrow { .. } => &ws.tile_keys[0],
+        };
         let lists = |mode| {
             [
                 (0, view),
@@ -273,21 +281,40 @@ impl Rasterizer {
                 (4, &ws.projected),
                 (5, &ws.intersection_counts),
                 (6, &ws.block_sums),
-                (7, &ws.tile_keys[0]),
+                (7, lists_key),
                 (8, &ws.slots[0]),
                 (9, &ws.slot_gaussians),
             ]
         };
         k.tile_lists.dispatch_indirect(gpu, pass, &lists(&self.count_mode), visible);
-        self.encode_scan(pass, prepared, &self.intersection_scan);
+        let scan = [(0, view), (1, &ws.block_sums), (2, &ws.counters), (3, &ws.ranges)];
+        let groups = match &k.ordering {
+            Ordering::Wide { .. } => 2,
+            Ordering::Narrow { .. } => 1,
+        };
+        k.scan_blocks.dispatch(gpu, pass, &scan, [groups, 1, 1]);
         k.tile_lists.dispatch_indirect(gpu, pass, &lists(&self.emit_mode), visible);
-        let by_tile = SortJob { keys: &ws.tile_keys, values: &ws.slots, counter: INTERSECTION_COUNTER, bits: tile_bits(tiles) };
-        let sorted = k.sort.encode(gpu, pass, ws, &by_tile);
-        debug_assert_eq!(sorted, prepared.sorted);
-        let ranges = [(0, view), (1, &ws.counters), (2, &ws.tile_keys[sorted]), (3, &ws.ranges)];
-        k.tile_ranges.dispatch(gpu, pass, &ranges, workgroups(tiles.div_ceil(256)));
-        if self.form() == BlendForm::Narrow {
-            k.order_tiles.dispatch(gpu, pass, &[(0, view), (1, &ws.ranges)], [1, 1, 1]);
+        match &k.ordering {
+            Ordering::Wide { sort_tiles } => {
+                let bindings = [
+                    (0, view),
+                    (1, &ws.ranges),
+                    (2, &ws.slot_gaussians),
+                    (3, &ws.projected),
+                    (4, &ws.slots[0]),
+                    (5, &ws.tile_keys[0]),
+                ];
+                sort_tiles.dispatch(gpu, pass, &bindings, workgroups(tiles));
+            }
+            Ordering::Narrow { sort, tile_ranges, order_tiles } => {
+                let by_tile =
+                    SortJob { keys: &ws.tile_keys, values: &ws.slots, counter: INTERSECTION_COUNTER, bits: tile_bits(tiles) };
+                let sorted = sort.encode(gpu, pass, ws, &by_tile);
+                debug_assert_eq!(sorted, prepared.sorted);
+                let ranges = [(0, view), (1, &ws.counters), (2, &ws.tile_keys[sorted]), (3, &ws.ranges)];
+                tile_ranges.dispatch(gpu, pass, &ranges, workgroups(tiles.div_ceil(256)));
+                order_tiles.dispatch(gpu, pass, &[(0, view), (1, &ws.ranges)], [1, 1, 1]);
+            }
         }
     }
 

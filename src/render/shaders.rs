@@ -49,6 +49,7 @@ const VIEW: &str = include_str!("../../shaders/shared/view.wgsl");
 const COUNTERS: &str = include_str!("../../shaders/shared/counters.wgsl");
 const PROJECTION: &str = include_str!("../../shaders/shared/projection.wgsl");
 const HARMONICS: &str = include_str!("../../shaders/shared/spherical_harmonics.wgsl");
+const DEPTH_KEY: &str = include_str!("../../shaders/shared/depth_key.wgsl");
 const TILE: &str = include_str!("../../shaders/shared/tile.wgsl");
 const TILE_BACKWARD: &str = include_str!("../../shaders/shared/tile_backward.wgsl");
 const EXCLUSIVE_SUM: &str = include_str!("../../shaders/shared/exclusive_sum.wgsl");
@@ -76,10 +77,11 @@ macro_rules! shaders {
 shaders! {
     PROJECT_FORWARD = "project_forward", "project_forward", [VIEW, PROJECTION, HARMONICS], ["main"];
     SCAN_BLOCKS = "scan_blocks", "scan_blocks", [VIEW, COUNTERS, EXCLUSIVE_SUM], ["main"];
-    COMPACT_VISIBLE = "compact_visible", "compact_visible", [VIEW], ["main"];
+    COMPACT_VISIBLE = "compact_visible", "compact_visible", [VIEW, COUNTERS, DEPTH_KEY], ["main"];
     SORT = "sort", "sort", [VIEW, COUNTERS], ["count_digits", "scan_digits", "scatter"];
     TILE_LISTS_NARROW = "tile_lists_narrow", "tile_lists_narrow", [VIEW, COUNTERS, EXCLUSIVE_SUM, TILE_ROWS], ["main"];
     TILE_LISTS_WIDE = "tile_lists_wide", "tile_lists_wide", [VIEW, COUNTERS, EXCLUSIVE_SUM, TILE_ROWS], ["main"];
+    SORT_TILES = "sort_tiles", "sort_tiles", [VIEW, DEPTH_KEY], ["main"];
     TILE_RANGES = "tile_ranges", "tile_ranges", [VIEW, COUNTERS], ["main"];
     ORDER_TILES = "order_tiles", "order_tiles", [VIEW], ["main"];
     RASTERIZE_FORWARD = "rasterize_forward", "rasterize_forward", [VIEW, TILE], ["main"];

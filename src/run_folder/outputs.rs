@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 use image::{GenericImage, RgbImage};
 use serde::Serialize;
@@ -248,12 +248,8 @@ pub fn evaluate(
     }
     let mut comparison = Comparison::of(input.trajectory, truth.zip(all.as_ref()));
     let is_held_out = |index: usize| config.replay.is_held_out(index);
-    let held_out = input.poses.iter().filter(|(index, _)| is_held_out(*index)).count();
-    let mut pictures = Pictures::new(out, held_out);
-    let mut on_held_out = |view: ComparedView| {
-        pictures.add(&view);
-        comparison.views.push(view.figures);
-    };
+    let held_out = input.poses.iter().map(|(index, _)| *index).filter(|index| is_held_out(*index)).collect::<Vec<_>>();
+    let pictures = Pictures::new(out, &held_out);
     let selection = ViewSelection {
         poses: &input.poses,
         keyframes: &input.keyframe_indices,
@@ -261,7 +257,8 @@ pub fn evaluate(
         exposures: &input.exposures,
     };
     let source = ViewSource { sequence, map_scale: config.map_scale, gpu, cloud: input.cloud, surface: config.mapping.surface };
-    let images = evaluate_views(source, &selection, &mut on_held_out, on_view)?;
+    let (images, views) = evaluate_views(source, &selection, &|view| pictures.add(view), on_view)?;
+    comparison.views = views;
     pictures.finish()?;
     write_records(&out.join(COMPARISON), &comparison)?;
     Ok(Evaluation {
@@ -277,28 +274,31 @@ pub fn evaluate(
     })
 }
 
-/// Pictures of at most [`MAX_PICTURES`] held-out views, spread evenly. None is written after the first that fails.
+/// Pictures of at most [`MAX_PICTURES`] held-out views, spread evenly. None is begun after one has failed.
 struct Pictures<'a> {
     out: &'a Path,
-    every: usize,
-    seen: usize,
-    error: Option<OutputError>,
+    frames: BTreeSet<usize>,
+    error: OnceLock<OutputError>,
 }
 
 impl<'a> Pictures<'a> {
-    fn new(out: &'a Path, held_out: usize) -> Self {
-        Self { out, every: held_out.div_ceil(MAX_PICTURES).max(1), seen: 0, error: None }
+    fn new(out: &'a Path, held_out: &[usize]) -> Self {
+        let every = held_out.len().div_ceil(MAX_PICTURES).max(1);
+        Self { out, frames: held_out.iter().step_by(every).copied().collect(), error: OnceLock::new() }
     }
 
-    fn add(&mut self, view: &ComparedView) {
-        if self.error.is_none() && self.seen.is_multiple_of(self.every) {
-            self.error = write_picture(self.out, view).err();
+    fn add(&self, view: &ComparedView) {
+        if self.error.get().is_none()
+            && self.frames.contains(&view.figures.frame)
+            && let Err(error) = write_picture(self.out, view)
+        {
+            // Of several that fail at once, the first is reported.
+            let _ = self.error.set(error);
         }
-        self.seen += 1;
     }
 
     fn finish(self) -> Result<(), OutputError> {
-        self.error.map_or(Ok(()), Err)
+        self.error.into_inner().map_or(Ok(()), Err)
     }
 }
 

@@ -114,7 +114,7 @@ fn held_out(recording: &Recording, log: &TrackedLog, gpu: &Arc<Gpu>, mapped: &Ma
     let selection = ViewSelection { poses: &poses, keyframes: &BTreeSet::new(), is_held_out: &is_held_out, exposures };
     let source =
         ViewSource { sequence: recording.sequence(), map_scale: config.map_scale, gpu, cloud, surface: config.mapping.surface };
-    evaluate_views(source, &selection, &mut |_| (), &|_| ()).into_diagnostic()
+    Ok(evaluate_views(source, &selection, &|_| (), &|_| ()).into_diagnostic()?.0)
 }
 
 fn print(row: &Row) {

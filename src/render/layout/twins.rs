@@ -77,13 +77,6 @@ host_twins! {
         /// Workgroups for one bucket of a tile's list a workgroup.
         per_bucket: [u32; 3],
     }
-    /// Which of the two prefix sums (`shaders/scan_blocks.wgsl`).
-    ScanSetup {
-        /// Counter that receives the total.
-        counter: u32,
-        /// Unused.
-        pad: [u32; 3],
-    }
     /// What a step leaves behind (`shaders/loss_reduce.wgsl`).
     StepLog {
         /// Sums over the pixels: |colour error|, SSIM, |depth error|, squared colour error.
