@@ -1,6 +1,6 @@
 //! What happens when the GPU gives way in the middle of a run: a typed error, and everything mapped until then.
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use crate::common::recording::{ITERATIONS_PER_KEYFRAME, recording, scratch, skipped_without_adapter};
 use fastrand::Rng;
@@ -88,7 +88,7 @@ fn buffers_beyond_the_adapter_are_refused_and_nothing_is_lost() {
     let before = rasterizer.render(&map, &view, [0.0; 3]).unwrap();
     (view.pinhole.width, view.pinhole.height) = (4096, 4096);
     let refused = rasterizer.render(&map, &view, [0.0; 3]).unwrap_err();
-    assert!(refused.to_string().contains("256 MiB is needed, but the adapter binds at most 8 MiB"), "{refused}");
+    assert!(refused.to_string().contains("MiB is needed, but the adapter binds at most 8 MiB"), "{refused}");
     (view.pinhole.width, view.pinhole.height) = (64, 48);
     assert_eq!(rasterizer.render(&map, &view, [0.0; 3]).unwrap(), before);
 }
@@ -101,9 +101,16 @@ fn a_gpu_that_hangs_is_reported() {
     }
     let gpu = Gpu::open(None).unwrap();
     let [from, to] = ["from", "to"].map(|label| GpuBuffer::storage(&gpu, label, 64 << 20).unwrap());
-    let mut encoder = gpu.device.create_command_encoder(&Default::default());
-    (0..50).for_each(|_| encoder.copy_buffer_to_buffer(from.raw(), 0, to.raw(), 0, from.raw().size()));
-    gpu.queue.submit([encoder.finish()]);
+    let copy = |times: u32| {
+        let mut encoder = gpu.device.create_command_encoder(&Default::default());
+        (0..times).for_each(|_| encoder.copy_buffer_to_buffer(from.raw(), 0, to.raw(), 0, from.raw().size()));
+        gpu.queue.submit([encoder.finish()]);
+    };
+    let started = Instant::now();
+    copy(10);
+    gpu.wait().unwrap();
+    let half_a_second = 5.0 / started.elapsed().as_secs_f64();
+    copy(half_a_second.clamp(10.0, 20_000.0) as u32);
     let error = gpu.wait_at_most(Duration::ZERO).unwrap_err();
     assert!(matches!(error, GpuError::Hung { .. }) && error.to_string().contains("counts as hung"), "{error}");
     assert!(matches!(to.read::<u32>(&gpu, 0, 1), Err(GpuError::Hung { .. })));

@@ -8,6 +8,7 @@ mod antialiasing;
 mod density;
 mod embedding;
 mod failures;
+mod lists;
 mod long_optimisation;
 mod loop_moves_map;
 mod mapper;
