@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""Times gsplat's training step on a map and a view of keysplat's, for a table beside `keysplat bench step --run`.
+"""Times gsplat's training step on a run's map and view, for a table beside keysplat's.
 
-    gsplat_step.py <run folder> --camera <fx> <fy> <cx> <cy> <width> <height> [--out <JSON>]
+    keysplat bench step --run out/kitchen --gaussians 100000000 --out step.json
+    gsplat_step.py out/kitchen/map.ply step.json [--out <JSON>]
 
-Needs PyTorch with CUDA and gsplat. The view is the run's middle keyframe, as in `keysplat bench step --run`. Three steps are timed with
-CUDA events, medians in milliseconds: `raster` (forward and backward), `l1` (with the L1 loss and Adam) and `ssim` (with SSIM by
-convolutions as well). keysplat's own step holds all of that and the loss on depth.
+Needs PyTorch with CUDA and gsplat. Three steps are timed with CUDA events, medians in milliseconds: `raster` (forward and backward), `l1` (with the L1 loss of
+colour and depth, and Adam of the visible Gaussians) and `ssim` (with SSIM by convolutions as well). keysplat's own step holds all of that.
 """
 
 import argparse
@@ -29,20 +29,6 @@ def read_ply(path):
     count = next(int(line.split()[-1]) for line in lines if line.startswith("element vertex"))
     table = np.frombuffer(body, dtype="<f4", count=count * len(names)).reshape(count, len(names))
     return {name: table[:, i].copy() for i, name in enumerate(names)}
-
-
-def camera_from_world(run):
-    """Pose of the middle keyframe, 4×4."""
-    rows = [line.split() for line in (run / "keyframes.txt").read_text().splitlines() if line and not line.startswith("#")]
-    x, y, z, qx, qy, qz, qw = map(float, rows[len(rows) // 2][1:8])
-    rotation = np.array([
-        [1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy - qz * qw), 2 * (qx * qz + qy * qw)],
-        [2 * (qx * qy + qz * qw), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz - qx * qw)],
-        [2 * (qx * qz - qy * qw), 2 * (qy * qz + qx * qw), 1 - 2 * (qx * qx + qy * qy)],
-    ])
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, (x, y, z)
-    return np.linalg.inv(pose).astype(np.float32)
 
 
 def parameters(columns):
@@ -85,18 +71,19 @@ def median_ms(step, repeats):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("run", type=pathlib.Path)
-    parser.add_argument("--camera", type=float, nargs=6, required=True)
+    parser.add_argument("map", type=pathlib.Path)
+    parser.add_argument("step", type=pathlib.Path)
     parser.add_argument("--repeats", type=int, default=200)
     parser.add_argument("--out", type=pathlib.Path)
     args = parser.parse_args()
-    fx, fy, cx, cy, width, height = args.camera
-    width, height = int(width), int(height)
-    params = parameters(read_ply(args.run / "map.ply"))
+    camera = json.loads(args.step.read_text())["view"]
+    width, height = camera["width"], camera["height"]
+    params = parameters(read_ply(args.map))
     count = len(params["means"])
-    view = torch.tensor(camera_from_world(args.run), device="cuda")[None]
+    view = torch.tensor(camera["camera_from_world"], device="cuda", dtype=torch.float32)[None]
     # gsplat's pixel centres lie at half a pixel.
-    intrinsics = torch.tensor([[[fx, 0, cx + 0.5], [0, fy, cy + 0.5], [0, 0, 1]]], device="cuda", dtype=torch.float32)
+    rows = [[camera["fx"], 0, camera["cx"] + 0.5], [0, camera["fy"], camera["cy"] + 0.5], [0, 0, 1]]
+    intrinsics = torch.tensor([rows], device="cuda", dtype=torch.float32)
     coefficients = 1 + (params["shN"].shape[1] if "shN" in params else 0)
     degree = round(coefficients**0.5) - 1
     offsets = torch.arange(11, device="cuda", dtype=torch.float32) - 5

@@ -40,8 +40,8 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
         workgroupBarrier();
         for (var size = 2u; size < 2u * length; size *= 2u) {
             for (var pair = local; pair < pairs(length, size); pair += THREADS) {
-                let first = 2u * (pair - (pair & (size / 2u - 1u)));
                 let within = pair & (size / 2u - 1u);
+                let first = 2u * (pair - within);
                 put_in_order(length, first + within, first + size - 1u - within);
             }
             workgroupBarrier();

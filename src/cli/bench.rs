@@ -106,9 +106,34 @@ struct Report {
     cpu: Option<String>,
     version: &'static str,
     rates: Rates,
+    /// Of a run's map.
+    view: Option<ViewReport>,
     steps: Vec<StepReport>,
     /// Scenes that the adapter cannot hold.
     too_large: Vec<StepBench>,
+}
+
+/// A view in numbers that others can use.
+#[derive(Serialize)]
+struct ViewReport {
+    fx: f64,
+    fy: f64,
+    /// Pixel centres are integers.
+    cx: f64,
+    cy: f64,
+    width: u32,
+    height: u32,
+    /// Rows of the 4×4 matrix.
+    camera_from_world: [[f64; 4]; 4],
+}
+
+impl From<&ViewCamera> for ViewReport {
+    fn from(camera: &ViewCamera) -> Self {
+        let Pinhole { fx, fy, cx, cy, width, height } = camera.pinhole;
+        let matrix = camera.camera_from_world.to_homogeneous();
+        let camera_from_world = std::array::from_fn(|row| std::array::from_fn(|column| matrix[(row, column)]));
+        Self { fx, fy, cx, cy, width, height, camera_from_world }
+    }
 }
 
 pub fn bench(args: &BenchArgs, verbosity: Verbosity) -> miette::Result<()> {
@@ -130,6 +155,7 @@ fn empty_report(gpu: &Gpu, rates: Rates) -> Report {
         cpu: keysplat::evaluation::machine::cpu_name(),
         version: env!("CARGO_PKG_VERSION"),
         rates,
+        view: None,
         steps: Vec::new(),
         too_large: Vec::new(),
     }
@@ -164,13 +190,13 @@ fn step(args: &StepArgs) -> miette::Result<()> {
         Ok::<_, miette::Report>(())
     };
     let recorded = args.run.as_deref().map(RecordedView::open).transpose()?;
+    let view = recorded.as_ref().map(|recorded| ViewReport::from(&recorded.camera()));
     for &gaussians in &args.gaussians {
         if let Some(view) = &recorded {
             let cloud = view.cloud.thinned(gaussians);
             let Pinhole { width, height, .. } = view.image.pinhole;
-            let camera = ViewCamera { pinhole: view.image.pinhole, camera_from_world: view.world_from_camera.inverse() };
             let depth = view.image.depth.as_ref().map(|depth| depth.metres.as_slice());
-            let scene = BenchScene::of_map(&gpu, &cloud, camera, &view.image.color, depth);
+            let scene = BenchScene::of_map(&gpu, &cloud, view.camera(), &view.image.color, depth);
             let sh_degree = cloud.sh_degree;
             measure(scene, config(cloud.len(), width, height, sh_degree))?;
             continue;
@@ -183,6 +209,7 @@ fn step(args: &StepArgs) -> miette::Result<()> {
             }
         }
     }
+    report.view = view;
     write(&report, args)
 }
 
@@ -205,6 +232,10 @@ struct RecordedView {
 }
 
 impl RecordedView {
+    fn camera(&self) -> ViewCamera {
+        ViewCamera { pinhole: self.image.pinhole, camera_from_world: self.world_from_camera.inverse() }
+    }
+
     fn open(dir: &Path) -> miette::Result<Self> {
         let recording = Recording::open(Config::read(&dir.join(outputs::CONFIG)).into_diagnostic()?).into_diagnostic()?;
         let (sequence, config) = (recording.sequence(), recording.config());

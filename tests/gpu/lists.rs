@@ -48,7 +48,8 @@ fn lists_of_any_length_have_one_order_in_both_forms() {
         assert_eq!(wide, again, "{count} Gaussians");
         let longest = wide.transmittance.iter().copied().fold(1.0, f32::min).ln() / (1.0 - OPACITY).ln();
         assert!(count < 100 || longest > 0.9 * count.min(2000) as f32, "{count} Gaussians: about {longest} blended");
-        let difference = |a: &[f32; 4], b: &[f32; 4]| a.iter().zip(b).map(|(a, b)| (a - b).abs() / (1.0 + b.abs())).fold(0.0, f32::max);
+        let difference =
+            |a: &[f32; 4], b: &[f32; 4]| a.iter().zip(b).map(|(a, b)| (a - b).abs() / (1.0 + b.abs())).fold(0.0, f32::max);
         let worst = wide.color_depth.iter().zip(&narrow.color_depth).map(|(a, b)| difference(a, b)).fold(0.0, f32::max);
         assert!(worst < 1e-4, "{count} Gaussians: {worst}");
     }
