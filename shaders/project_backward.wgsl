@@ -24,11 +24,14 @@ fn backward(i: u32) {
     var first = vec4(0.0);
     var second = vec4(0.0);
     let end = intersection_counts[view.capacity + 2u * i + 1u];
-    // `sum_slots` has left the sums of a chunk in its first slot.
-    for (var slot = intersection_counts[view.capacity + 2u * i]; slot < end; slot = (slot / SLOT_CHUNK + 1u) * SLOT_CHUNK) {
+    var slot = intersection_counts[view.capacity + 2u * i];
+    while slot < end {
         color_depth += intersection_gradients[slot * 3u];
         first += intersection_gradients[slot * 3u + 1u];
         second += intersection_gradients[slot * 3u + 2u];
+        // `sum_slots` has left the sum of a chunk in its first slot.
+        let is_sum = slot % SLOT_CHUNK == 0u && slot + SLOT_CHUNK <= end;
+        slot += select(1u, SLOT_CHUNK, is_sum);
     }
     let untouched = all(color_depth == vec4(0.0)) && all(first == vec4(0.0)) && all(second == vec4(0.0));
     if untouched {

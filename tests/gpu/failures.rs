@@ -106,10 +106,14 @@ fn a_gpu_that_hangs_is_reported() {
         (0..times).for_each(|_| encoder.copy_buffer_to_buffer(from.raw(), 0, to.raw(), 0, from.raw().size()));
         gpu.queue.submit([encoder.finish()]);
     };
-    let started = Instant::now();
-    copy(10);
-    gpu.wait().unwrap();
-    let half_a_second = 5.0 / started.elapsed().as_secs_f64();
+    let time = |_| {
+        let started = Instant::now();
+        copy(10);
+        gpu.wait().unwrap();
+        started.elapsed().as_secs_f64()
+    };
+    // The first time the adapter may have to wake up.
+    let half_a_second = 5.0 / (0..3).map(time).fold(f64::INFINITY, f64::min);
     copy(half_a_second.clamp(10.0, 20_000.0) as u32);
     let error = gpu.wait_at_most(Duration::ZERO).unwrap_err();
     assert!(matches!(error, GpuError::Hung { .. }) && error.to_string().contains("counts as hung"), "{error}");
