@@ -45,7 +45,14 @@ struct Kernels {
 #[derive(Debug)]
 enum Ordering {
     Wide { sort_tiles: Kernel },
-    Narrow { sort: Sort, tile_ranges: Kernel, order_tiles: Kernel },
+    Narrow(Box<ByRadix>),
+}
+
+#[derive(Debug)]
+struct ByRadix {
+    sort: Sort,
+    tile_ranges: Kernel,
+    order_tiles: Kernel,
 }
 
 /// The forward pass with its scratch buffers; the optimiser reads these for the backward pass.
@@ -112,11 +119,11 @@ impl Rasterizer {
             scan_blocks: kernel(&shaders::SCAN_BLOCKS),
             ordering: match form {
                 BlendForm::Wide => Ordering::Wide { sort_tiles: kernel(&shaders::SORT_TILES) },
-                BlendForm::Narrow => Ordering::Narrow {
+                BlendForm::Narrow => Ordering::Narrow(Box::new(ByRadix {
                     sort: Sort::new(&gpu)?,
                     tile_ranges: kernel(&shaders::TILE_RANGES),
                     order_tiles: kernel(&shaders::ORDER_TILES),
-                },
+                })),
             },
         };
         gpu.check()?;
@@ -255,9 +262,9 @@ impl Rasterizer {
             (8, &ws.ranges),
         ];
         k.compact_visible.dispatch(gpu, pass, &compact, per_gaussian);
-        if let Ordering::Narrow { sort, .. } = &k.ordering {
+        if let Ordering::Narrow(narrow) = &k.ordering {
             let by_depth = SortJob { keys: &ws.depth_keys, values: &ws.order, counter: VISIBLE_COUNTER, bits: DEPTH_KEY_BITS };
-            sort.encode(gpu, pass, ws, &by_depth);
+            narrow.sort.encode(gpu, pass, ws, &by_depth);
         }
         self.encode_tiles(pass, prepared);
         k.rasterize_forward.dispatch(gpu, pass, &self.lists(prepared), self.form().workgroups(view.tiles()));
@@ -270,7 +277,7 @@ impl Rasterizer {
         let visible = IndirectSize { buffer: &ws.counters, offset: Counter::per_element_offset(VISIBLE_COUNTER) };
         let lists_key = match &k.ordering {
             Ordering::Wide { .. } => &ws.ranges,
-            Ordering::Narrow { .. } => &ws.tile_keys[0],
+            Ordering::Narrow(_) => &ws.tile_keys[0],
         };
         let lists = |mode| {
             [
@@ -290,7 +297,7 @@ impl Rasterizer {
         let scan = [(0, view), (1, &ws.block_sums), (2, &ws.counters), (3, &ws.ranges)];
         let groups = match &k.ordering {
             Ordering::Wide { .. } => 2,
-            Ordering::Narrow { .. } => 1,
+            Ordering::Narrow(_) => 1,
         };
         k.scan_blocks.dispatch(gpu, pass, &scan, [groups, 1, 1]);
         k.tile_lists.dispatch_indirect(gpu, pass, &lists(&self.emit_mode), visible);
@@ -306,7 +313,8 @@ impl Rasterizer {
                 ];
                 sort_tiles.dispatch(gpu, pass, &bindings, workgroups(tiles));
             }
-            Ordering::Narrow { sort, tile_ranges, order_tiles } => {
+            Ordering::Narrow(narrow) => {
+                let ByRadix { sort, tile_ranges, order_tiles } = &**narrow;
                 let by_tile =
                     SortJob { keys: &ws.tile_keys, values: &ws.slots, counter: INTERSECTION_COUNTER, bits: tile_bits(tiles) };
                 let sorted = sort.encode(gpu, pass, ws, &by_tile);
