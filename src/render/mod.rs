@@ -2,6 +2,7 @@
 
 mod cloud;
 pub mod layout;
+mod ordering;
 mod plan;
 mod rasterizer;
 mod rendered;

@@ -8,16 +8,13 @@ use std::sync::Arc;
 
 use super::cloud::GpuCloud;
 use super::layout::{BlendForm, Blending, COUNTERS, Counter, INTERSECTION_COUNTER, TileListsSetup, VISIBLE_COUNTER, View};
+use super::ordering::Ordering;
 use super::rendered::Rendered;
 use super::shaders;
-use super::sort::{Sort, SortJob};
 use super::workspace::{Capacities, Workspace};
 use crate::gpu::{Gpu, GpuBuffer, GpuError, IndirectSize, Kernel, UniformCell, Uniforms, workgroups};
 use crate::splat::ViewCamera;
 use crate::splat::model::Surface;
-
-/// See [`depth_key`](crate::splat::model::depth_key).
-const DEPTH_KEY_BITS: u32 = 16;
 
 /// Sort keys and values twice, and the Gaussian.
 const INTERSECTION_BYTES: u64 = 20;
@@ -39,20 +36,6 @@ struct Kernels {
     rasterize_forward: Kernel,
     scan_blocks: Kernel,
     ordering: Ordering,
-}
-
-/// What brings intersections into the order of blending.
-#[derive(Debug)]
-enum Ordering {
-    Wide { sort_tiles: Kernel },
-    Narrow(Box<ByRadix>),
-}
-
-#[derive(Debug)]
-struct ByRadix {
-    sort: Sort,
-    tile_ranges: Kernel,
-    order_tiles: Kernel,
 }
 
 /// The forward pass with its scratch buffers; the optimiser reads these for the backward pass.
@@ -117,14 +100,7 @@ impl Rasterizer {
             }),
             rasterize_forward: kernel(&shaders::RASTERIZE_FORWARD),
             scan_blocks: kernel(&shaders::SCAN_BLOCKS),
-            ordering: match form {
-                BlendForm::Wide => Ordering::Wide { sort_tiles: kernel(&shaders::SORT_TILES) },
-                BlendForm::Narrow => Ordering::Narrow(Box::new(ByRadix {
-                    sort: Sort::new(&gpu)?,
-                    tile_ranges: kernel(&shaders::TILE_RANGES),
-                    order_tiles: kernel(&shaders::ORDER_TILES),
-                })),
-            },
+            ordering: Ordering::new(&gpu, blending)?,
         };
         gpu.check()?;
         Ok(Self {
@@ -205,10 +181,7 @@ impl Rasterizer {
 
     /// Which of `workspace.slots` holds the sorted intersections of a view of so many tiles.
     pub(crate) fn sorted(&self, tiles: u32) -> usize {
-        match self.form() {
-            BlendForm::Wide => 0,
-            BlendForm::Narrow => Sort::result_of(tile_bits(tiles)),
-        }
+        self.kernels.ordering.sorted(tiles)
     }
 
     /// What all passes over the sorted tile lists bind.
@@ -262,10 +235,7 @@ impl Rasterizer {
             (8, &ws.ranges),
         ];
         k.compact_visible.dispatch(gpu, pass, &compact, per_gaussian);
-        if let Ordering::Narrow(narrow) = &k.ordering {
-            let by_depth = SortJob { keys: &ws.depth_keys, values: &ws.order, counter: VISIBLE_COUNTER, bits: DEPTH_KEY_BITS };
-            narrow.sort.encode(gpu, pass, ws, &by_depth);
-        }
+        k.ordering.encode_before_lists(gpu, pass, ws);
         self.encode_tiles(pass, prepared);
         k.rasterize_forward.dispatch(gpu, pass, &self.lists(prepared), self.form().workgroups(view.tiles()));
     }
@@ -275,10 +245,6 @@ impl Rasterizer {
         let (gpu, ws, k) = (&*self.gpu, &self.workspace, &self.kernels);
         let (view, tiles) = (self.view(prepared), prepared.view.tiles());
         let visible = IndirectSize { buffer: &ws.counters, offset: Counter::per_element_offset(VISIBLE_COUNTER) };
-        let lists_key = match &k.ordering {
-            Ordering::Wide { .. } => &ws.ranges,
-            Ordering::Narrow(_) => &ws.tile_keys[0],
-        };
         let lists = |mode| {
             [
                 (0, view),
@@ -288,42 +254,16 @@ impl Rasterizer {
                 (4, &ws.projected),
                 (5, &ws.intersection_counts),
                 (6, &ws.block_sums),
-                (7, lists_key),
+                (7, k.ordering.listed(ws)),
                 (8, &ws.slots[0]),
                 (9, &ws.slot_gaussians),
             ]
         };
         k.tile_lists.dispatch_indirect(gpu, pass, &lists(&self.count_mode), visible);
         let scan = [(0, view), (1, &ws.block_sums), (2, &ws.counters), (3, &ws.ranges)];
-        let groups = match &k.ordering {
-            Ordering::Wide { .. } => 2,
-            Ordering::Narrow(_) => 1,
-        };
-        k.scan_blocks.dispatch(gpu, pass, &scan, [groups, 1, 1]);
+        k.scan_blocks.dispatch(gpu, pass, &scan, [k.ordering.scan_groups(), 1, 1]);
         k.tile_lists.dispatch_indirect(gpu, pass, &lists(&self.emit_mode), visible);
-        match &k.ordering {
-            Ordering::Wide { sort_tiles } => {
-                let bindings = [
-                    (0, view),
-                    (1, &ws.ranges),
-                    (2, &ws.slot_gaussians),
-                    (3, &ws.projected),
-                    (4, &ws.slots[0]),
-                    (5, &ws.tile_keys[0]),
-                ];
-                sort_tiles.dispatch(gpu, pass, &bindings, workgroups(tiles));
-            }
-            Ordering::Narrow(narrow) => {
-                let ByRadix { sort, tile_ranges, order_tiles } = &**narrow;
-                let by_tile =
-                    SortJob { keys: &ws.tile_keys, values: &ws.slots, counter: INTERSECTION_COUNTER, bits: tile_bits(tiles) };
-                let sorted = sort.encode(gpu, pass, ws, &by_tile);
-                debug_assert_eq!(sorted, prepared.sorted);
-                let ranges = [(0, view), (1, &ws.counters), (2, &ws.tile_keys[sorted]), (3, &ws.ranges)];
-                tile_ranges.dispatch(gpu, pass, &ranges, workgroups(tiles.div_ceil(256)));
-                order_tiles.dispatch(gpu, pass, &[(0, view), (1, &ws.ranges)], [1, 1, 1]);
-            }
-        }
+        k.ordering.encode_after_lists(gpu, pass, ws, (view, tiles));
     }
 
     /// Reads the counters of the last view; when its intersections did not fit, grows the buffers and returns `None`: repeat the step.
@@ -397,9 +337,4 @@ impl Rasterizer {
             });
         }
     }
-}
-
-/// Bits of the tiles' numbers.
-fn tile_bits(tiles: u32) -> u32 {
-    u32::BITS - tiles.leading_zeros()
 }
