@@ -10,6 +10,7 @@
 use std::sync::Arc;
 
 use ::image::RgbImage;
+use rayon::prelude::*;
 
 /// The window reaches this many pixels to each side: `int(3.5 σ + 0.5)` for σ = 1.5.
 const RADIUS: usize = 5;
@@ -136,7 +137,8 @@ pub fn ssim(rendered: &ImageF32, recorded: &ImageF32) -> Result<f64, ImageError>
     }
     let blanked = recorded.valid.as_ref().map(|valid| rendered.clone().masked(Some(valid)));
     let rendered = blanked.as_ref().unwrap_or(rendered);
-    let sum: f64 = (0..3).map(|channel| ssim_sum(rendered, recorded, channel)).sum();
+    let sums: Vec<f64> = (0..3).into_par_iter().map(|channel| ssim_sum(rendered, recorded, channel)).collect();
+    let sum: f64 = sums.iter().sum();
     let inner = (RADIUS..height - RADIUS).flat_map(|y| (RADIUS..width - RADIUS).map(move |x| y * width + x));
     let count = inner.filter(|&i| recorded.is_valid(i)).count();
     Ok(sum / (3 * count.max(1)) as f64)
