@@ -50,8 +50,8 @@ impl Preset {
                 mapping.first_iterations = 10;
                 mapping.window.recent = 4;
                 mapping.window.covisible = 2;
-                // Few steps fit between two keyframes, and density control costs about six of them: it runs after every fifth keyframe, and
-                // before the steps, so that no keyframe waits for it.
+                // Where few steps fit between two keyframes, the six or so that density control costs are many: it runs at every fifth keyframe,
+                // on fast adapters sooner, and before the steps, so that no keyframe waits for it.
                 mapping.density.every = 5;
                 mapping.density.after_share = 0.0;
             }

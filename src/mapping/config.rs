@@ -173,7 +173,7 @@ pub struct RefineConfig {
     /// Wall-clock time after the last keyframe, seconds: replaces the number of steps. Such a run does not repeat.
     // Checkpoints hold this struct in postcard, where no field may be left out.
     pub seconds: Option<f64>,
-    /// Density is controlled each time after so many steps,
+    /// Density is controlled each time after so many steps (in real time, at the next keyframe),
     pub density_every: usize,
     /// by the scores of so many keyframes, evenly spread over all.
     pub density_views: usize,

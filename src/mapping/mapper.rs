@@ -83,6 +83,8 @@ pub struct Mapper {
     host_times: HostTimes,
     /// Keyframes left of the running epoch of consolidation.
     epoch: Vec<usize>,
+    /// Steps at the last density control.
+    controlled_at: usize,
     /// Whether a map of others began this one.
     has_initial_map: bool,
     /// Whether the adapter has no room for more Gaussians, which is reported once.
@@ -111,6 +113,7 @@ impl Mapper {
             step_times: Vec::new(),
             host_times: HostTimes::default(),
             epoch: Vec::new(),
+            controlled_at: 0,
             has_initial_map: false,
             is_full: false,
             config: Arc::new(config),
@@ -263,7 +266,9 @@ impl Mapper {
         let window = schedule::window(&self.keyframes, &self.config.window);
         let config = self.config.clone();
         let density = &config.density;
-        let controlled = self.keyframes.len().is_multiple_of(density.every);
+        // Where an adapter takes hundreds of steps before the next keyframe, a few more for density control delay nothing.
+        let is_fast = config.yields_to_keyframes && self.step_times.len() - self.controlled_at >= config.refine.density_every;
+        let controlled = is_fast || self.keyframes.len().is_multiple_of(density.every);
         let mut scoring = if controlled { self.scoring_steps(&window, density) } else { Vec::new() };
         scoring.truncate(iterations);
         let unscored = iterations - scoring.len();
@@ -283,6 +288,7 @@ impl Mapper {
             let scored = self.take_scored(&scoring, &config.adam, density)?;
             taken += scored.0;
             (pruned, grown) = self.timed("density", |mapper| mapper.control_density(scored.1, density))?;
+            self.controlled_at = self.step_times.len();
         }
         let rest = self.with_consolidation(after);
         taken += self.take(&rest, &config.adam, interlude)?;
