@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
-"""Estimate of a training step's time on GPUs that are not there: counted bytes and instructions over published rates.
+"""Estimate of a training step's time on GPUs: counted bytes and instructions over published rates.
 
 A stage takes the longer of its bytes over the bandwidth and its instructions over the issue rate, but not less than its longest chain of
-dependent iterations; commands add their launches. Prints a table. Bandwidth and launches of the H100 are measured; the row below it is what its steps took
+dependent iterations; commands add their launches. Prints a table. Bandwidth and launches of the H100 are measured; beside its estimate stands what its steps took
 (benches/README.md), so that the estimates of the other GPUs can be judged.
 """
 

@@ -85,7 +85,7 @@ fn f16_to_f32(bits: u16) -> f32 {
     if exponent == 0 { mantissa * 2f32.powi(-24) } else { (1024.0 + mantissa) * 2f32.powi(exponent - 25) }
 }
 
-/// `rows` and `tiles` of each visible Gaussian, nearest first.
+/// `rows` and `tiles` of each visible Gaussian, in the order of listing.
 fn list_lanes(form: BlendForm, rows: &[u32], tiles: &[u32]) -> LaneUse {
     let mut lanes = LaneUse::default();
     if form == BlendForm::Narrow {

@@ -28,6 +28,13 @@ const BUSY_S: f64 = 0.05;
 /// # Errors
 /// [`GpuError`] if a buffer does not fit or the device fails.
 pub fn measure_rates(gpu: &Gpu) -> Result<Rates, GpuError> {
+    gpu.pause_profile(true);
+    let rates = measure(gpu);
+    gpu.pause_profile(false);
+    rates
+}
+
+fn measure(gpu: &Gpu) -> Result<Rates, GpuError> {
     let text = shaders::RATES.text(BlendForm::default());
     let copy = Kernel::new(gpu, "copy_memory", "copy_memory", &text);
     let multiply_add = Kernel::new(gpu, "multiply_add", "multiply_add", &text);
@@ -44,7 +51,6 @@ pub fn measure_rates(gpu: &Gpu) -> Result<Rates, GpuError> {
     let probe_s = best(gpu, &multiply_add, [&source, &sink], probe, 1)?;
     let groups = ((f64::from(probe) * BUSY_S / probe_s) as u32).clamp(probe, 4_000_000);
     let fma_s = best(gpu, &multiply_add, [&source, &sink], groups, 1)?;
-    gpu.take_profile()?;
     Ok(Rates {
         bytes_per_s: 2.0 * COPY_BYTES as f64 / copy_s,
         flops_per_s: f64::from(groups) * 256.0 * FLOPS_PER_INVOCATION / fma_s,

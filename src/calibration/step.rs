@@ -129,10 +129,11 @@ impl StepRunner {
         self.gpu.pause_profile(true);
         let encoded = self.trainer.encode_time();
         let started = Instant::now();
-        self.steps(self.batch)?;
+        let timed = self.steps(self.batch);
         let wall = started.elapsed() / self.batch as u32;
         let encoding = (self.trainer.encode_time() - encoded) / self.batch as u32;
         self.gpu.pause_profile(false);
+        timed?;
         if self.gpu.has_profile() {
             self.steps(BATCH)?;
         }
@@ -151,7 +152,7 @@ impl StepRunner {
 /// [`GpuError`] if a buffer does not fit or the device fails.
 pub fn bench_step(gpu: &Arc<Gpu>, scene: BenchScene, bench: &StepBench, rates: &Rates) -> Result<StepReport, GpuError> {
     let mut runner = StepRunner::new(gpu, scene, bench.form)?;
-    let times = (0..bench.steps.div_ceil(BATCH)).map(|_| runner.run()).collect::<Result<Vec<_>, _>>()?;
+    let times = (0..bench.steps.div_ceil(runner.batch)).map(|_| runner.run()).collect::<Result<Vec<_>, _>>()?;
     let ms = |part: &dyn Fn(&StepTimes) -> Duration| {
         let mut all: Vec<f64> = times.iter().map(|t| part(t).as_secs_f64() * 1e3).collect();
         all.sort_by(f64::total_cmp);
@@ -194,16 +195,22 @@ fn floors(work: &Work, bench: &StepBench, rates: &Rates) -> BTreeMap<&'static st
     // Separable 11-tap filters for a quarter of the windows: half of the columns in half of the rows, then half of these rows; five quantities
     // forward, three backward, on three channels.
     let taps = 2.0 * (0.5 + 0.25) * 11.0 * 3.0 * pixels;
-    BTreeMap::from([
+    let sorts = match bench.form {
+        BlendForm::Wide => vec![("sort_tiles", floor(intersections * 28.0, 0.0))],
+        BlendForm::Narrow => vec![
+            ("sort_count_digits", floor(4.0 * (depth_passes * visible + tile_passes * intersections), 0.0)),
+            ("sort_scatter", floor(16.0 * (depth_passes * visible + tile_passes * intersections), 0.0)),
+            ("tile_ranges", floor(intersections * 4.0, 0.0)),
+        ],
+    };
+    let stages = [
         ("project_forward", floor(n * (16.0 * (2.0 + coefficients) + 20.0) + visible * 64.0, n * 150.0)),
-        ("sort_count_digits", floor(4.0 * (depth_passes * visible + tile_passes * intersections), 0.0)),
-        ("sort_scatter", floor(16.0 * (depth_passes * visible + tile_passes * intersections), 0.0)),
         (bench.form.lists_stage(), floor(visible * 2.0 * 40.0 + intersections * 12.0, 2.0 * intersections * 40.0)),
-        ("tile_ranges", floor(intersections * 4.0, 0.0)),
         ("rasterize_forward", floor(intersections * 56.0 + pixels * 24.0, evaluations * 11.0 + blended * 24.0)),
         ("loss_forward", floor(pixels * (20.0 + 12.0 + 12.0), taps * 5.0)),
         ("loss_backward", floor(pixels * (20.0 + 12.0 + 12.0 + 32.0), taps * 3.0)),
         (bench.form.backward_stage(), floor(intersections * 104.0 + pixels * 56.0, back * 11.0 + blended * 70.0)),
         ("project_backward_adam", floor(intersections * 48.0 + visible * planes * 16.0 * 6.0, visible * (400.0 + planes * 60.0))),
-    ])
+    ];
+    stages.into_iter().chain(sorts).collect()
 }

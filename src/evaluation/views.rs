@@ -178,16 +178,15 @@ pub fn evaluate_views(
     };
     let mut means = ProtocolMeans::default();
     let mut records = Vec::new();
-    let (mut recorded, mut rendered, mut done) = (Vec::new(), Vec::new(), 0);
+    let (mut recorded, mut rendered) = (Vec::new(), Vec::new());
     // Three batches at a time: one is decoded, one rendered and one compared. Two rounds without new poses empty the pipeline.
-    for poses in selection.poses.chunks(BATCH).chain([&[] as &[_]; 2]) {
+    for (round, poses) in selection.poses.chunks(BATCH).chain([&[] as &[_]; 2]).enumerate() {
         let (to_render, to_compare) = (std::mem::take(&mut recorded), std::mem::take(&mut rendered));
         let ((next, renders), compared) =
             rayon::join(|| rayon::join(|| load(poses), || render(to_render)), || compare(to_compare));
         (recorded, rendered) = (next, renders?);
-        done += compared.len();
         records.extend(compared.into_iter().filter_map(|view| means.add(view)));
-        on_view(done);
+        on_view((round.saturating_sub(1) * BATCH).min(selection.poses.len()));
     }
     Ok((means.figures(), records))
 }

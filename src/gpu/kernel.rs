@@ -33,6 +33,19 @@ struct Compiled {
     layout: wgpu::BindGroupLayout,
 }
 
+/// Threads of their own: in the pool of everybody else, the first frames would wait behind all shaders. None where the system gives no threads.
+fn compilers() -> Option<&'static rayon::ThreadPool> {
+    const MOST: usize = 8;
+    static POOL: OnceLock<Option<rayon::ThreadPool>> = OnceLock::new();
+    let new = || {
+        let threads = rayon::current_num_threads().div_ceil(2).min(MOST);
+        let named = rayon::ThreadPoolBuilder::new().num_threads(threads).thread_name(|_| "compiling".into());
+        // A panic comes again where the kernel is used first, and is reported from there.
+        named.panic_handler(|_| ()).build().ok()
+    };
+    POOL.get_or_init(new).as_ref()
+}
+
 impl Compilation {
     fn result(&self) -> &Compiled {
         self.has_begun.store(true, Ordering::Relaxed);
@@ -117,12 +130,18 @@ impl Kernel {
             has_begun: AtomicBool::new(false),
             compiled: OnceLock::new(),
         });
-        let in_background = compilation.clone();
-        rayon::spawn(move || {
-            if !in_background.has_begun.swap(true, Ordering::Relaxed) {
-                in_background.result();
+        let in_background = Arc::downgrade(&compilation);
+        let compile = move || {
+            if let Some(compilation) = in_background.upgrade()
+                && !compilation.has_begun.swap(true, Ordering::Relaxed)
+            {
+                compilation.result();
             }
-        });
+        };
+        match compilers() {
+            Some(pool) => pool.spawn(compile),
+            None => compile(),
+        }
         Self { compilation, label, groups: Mutex::default() }
     }
 

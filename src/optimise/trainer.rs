@@ -104,7 +104,7 @@ impl Trainer {
     /// A trainer with the form of the blending passes that suits the adapter.
     ///
     /// # Errors
-    /// [`GpuError`] if a shader does not compile or a buffer does not fit.
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn new(gpu: Arc<Gpu>) -> Result<Self, GpuError> {
         let form = BlendForm::of(&gpu);
         Self::with_blending(gpu, form)
@@ -113,7 +113,7 @@ impl Trainer {
     /// A trainer with the given blending passes.
     ///
     /// # Errors
-    /// [`GpuError`] if a shader does not compile or a buffer does not fit.
+    /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn with_blending(gpu: Arc<Gpu>, blending: impl Into<Blending>) -> Result<Self, GpuError> {
         let rasterizer = Rasterizer::with_blending(gpu, blending)?;
         let gpu = rasterizer.gpu();

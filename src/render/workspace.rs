@@ -20,9 +20,9 @@ pub(crate) struct Workspace {
     /// Per workgroup of 256.
     pub(super) block_sums: GpuBuffer,
     pub(super) depth_keys: [GpuBuffer; 2],
-    /// Visible Gaussians, nearest first, in `[0]` after the depth sort.
+    /// Visible Gaussians in `[0]`: in map order, or in the narrow form nearest first after the depth sort.
     pub(crate) order: [GpuBuffer; 2],
-    /// Per visible Gaussian its intersections, nearest first; then per Gaussian where its slots begin and end; then the visible ones in map order.
+    /// Per visible Gaussian its intersections, in `order`; then per Gaussian where its slots begin and end; then the visible ones in map order.
     pub(crate) intersection_counts: GpuBuffer,
     // Per intersection.
     pub(crate) intersection_capacity: usize,

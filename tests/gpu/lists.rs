@@ -40,7 +40,7 @@ fn lists_of_any_length_have_one_order_in_both_forms() {
     let mut rng = Rng::with_seed(11);
     let mut forms = BlendForm::ALL.map(|form| Rasterizer::with_blending(gpu.clone(), form).unwrap());
     // Around powers of two, and beyond what workgroup memory holds.
-    for count in [1, 2, 3, 63, 64, 65, 500, 1023, 1024, 1025, 1500, 4097] {
+    for count in [1, 2, 3, 63, 64, 65, 511, 512, 513, 1023, 1024, 1025, 1500, 4097] {
         let (cloud, camera) = veils(&mut rng, count);
         let on_gpu = upload(&gpu, &cloud);
         let [wide, narrow] = forms.each_mut().map(|form| form.render(&on_gpu, &camera, [0.1, 0.2, 0.3]).unwrap());
