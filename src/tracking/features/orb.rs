@@ -84,6 +84,8 @@ struct Level {
 impl Extractor {
     /// `features` are kept of each image.
     pub fn new(width: u32, height: u32, features: usize, config: &TrackingConfig) -> Self {
+        // Frames and levels run side by side: threads of OpenCV's own are in their way. Only the speed depends on it.
+        let _ = opencv::core::set_num_threads(1);
         let scale = |level: usize| config.pyramid_scale.powi(level as i32);
         let total: f64 = (0..config.pyramid_levels).map(|l| 1.0 / scale(l)).sum();
         let levels = (0..config.pyramid_levels)
