@@ -1,87 +1,19 @@
 //! One compute pipeline with its bindings, which are read from the shader itself.
 
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, OnceLock, PoisonError, Weak};
+use std::sync::{Arc, Mutex, PoisonError, Weak};
 
 use super::{Gpu, GpuBuffer};
 
 /// Bind groups that a kernel keeps for the next dispatch over the same buffers.
 const KEPT: usize = 64;
 
-/// An entry point, which is compiled in the background: drivers take tenths of a second for each, and many can be compiled side by side.
+/// A compiled entry point.
 #[derive(Debug)]
 pub struct Kernel {
-    compilation: Arc<Compilation>,
-    label: &'static str,
-    groups: Mutex<Vec<Group>>,
-}
-
-/// What to compile, and the result once somebody has.
-#[derive(Debug)]
-struct Compilation {
-    device: wgpu::Device,
-    label: &'static str,
-    entry_point: String,
-    source: String,
-    has_begun: AtomicBool,
-    compiled: OnceLock<Compiled>,
-}
-
-#[derive(Debug)]
-struct Compiled {
     pipeline: wgpu::ComputePipeline,
     layout: wgpu::BindGroupLayout,
-}
-
-/// Threads of their own: in the pool of everybody else, the first frames would wait behind all shaders. None where the system gives no threads.
-fn compilers() -> Option<&'static rayon::ThreadPool> {
-    const MOST: usize = 8;
-    static POOL: OnceLock<Option<rayon::ThreadPool>> = OnceLock::new();
-    let new = || {
-        let threads = rayon::current_num_threads().div_ceil(2).min(MOST);
-        let named = rayon::ThreadPoolBuilder::new().num_threads(threads).thread_name(|_| "compiling".into());
-        // A panic comes again where the kernel is used first, and is reported from there.
-        named.panic_handler(|_| ()).build().ok()
-    };
-    POOL.get_or_init(new).as_ref()
-}
-
-impl Compilation {
-    fn result(&self) -> &Compiled {
-        self.has_begun.store(true, Ordering::Relaxed);
-        self.compiled.get_or_init(|| self.compile())
-    }
-
-    fn compile(&self) -> Compiled {
-        let label = Some(self.label);
-        let descriptor = wgpu::ShaderModuleDescriptor { label, source: wgpu::ShaderSource::Wgsl(self.source.as_str().into()) };
-        // SAFETY: the sources are ours, every loop ends, and every index is bounded by the lengths that size the buffers. Checks cost
-        // about a third of a training step on the software adapter.
-        let module = unsafe { self.device.create_shader_module_trusted(descriptor, wgpu::ShaderRuntimeChecks::unchecked()) };
-        let pipeline = self.device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
-            label,
-            layout: None,
-            module: &module,
-            entry_point: Some(&self.entry_point),
-            compilation_options: wgpu::PipelineCompilationOptions {
-                // Shaders clear what has to start from zero: on Metal and DX12 one invocation would clear all of it.
-                zero_initialize_workgroup_memory: false,
-                ..Default::default()
-            },
-            cache: None,
-        });
-        let layout = pipeline.get_bind_group_layout(0);
-        Compiled { pipeline, layout }
-    }
-}
-
-impl Drop for Kernel {
-    /// A compilation that has not begun never will, and one that has is waited for: a driver must not be compiling when the program ends.
-    fn drop(&mut self) {
-        if self.compilation.has_begun.swap(true, Ordering::Relaxed) {
-            self.compilation.result();
-        }
-    }
+    label: &'static str,
+    groups: Mutex<Vec<Group>>,
 }
 
 /// A bind group, and what it was made of.
@@ -120,29 +52,26 @@ pub struct IndirectSize<'a> {
 }
 
 impl Kernel {
-    /// `entry_point` of a WGSL `source`. What does not compile is an error of the device from its first use on (see [`Gpu::check`]).
+    /// Compiles `entry_point` of a WGSL `source`.
     pub fn new(gpu: &Gpu, label: &'static str, entry_point: &str, source: &str) -> Self {
-        let compilation = Arc::new(Compilation {
-            device: gpu.device.clone(),
-            label,
-            entry_point: entry_point.into(),
-            source: source.into(),
-            has_begun: AtomicBool::new(false),
-            compiled: OnceLock::new(),
+        let descriptor = wgpu::ShaderModuleDescriptor { label: Some(label), source: wgpu::ShaderSource::Wgsl(source.into()) };
+        // SAFETY: the sources are ours, every loop ends, and every index is bounded by the lengths that size the buffers. Checks cost
+        // about a third of a training step on the software adapter.
+        let module = unsafe { gpu.device.create_shader_module_trusted(descriptor, wgpu::ShaderRuntimeChecks::unchecked()) };
+        let pipeline = gpu.device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+            label: Some(label),
+            layout: None,
+            module: &module,
+            entry_point: Some(entry_point),
+            compilation_options: wgpu::PipelineCompilationOptions {
+                // Shaders clear what has to start from zero: on Metal and DX12 one invocation would clear all of it.
+                zero_initialize_workgroup_memory: false,
+                ..Default::default()
+            },
+            cache: None,
         });
-        let in_background = Arc::downgrade(&compilation);
-        let compile = move || {
-            if let Some(compilation) = in_background.upgrade()
-                && !compilation.has_begun.swap(true, Ordering::Relaxed)
-            {
-                compilation.result();
-            }
-        };
-        match compilers() {
-            Some(pool) => pool.spawn(compile),
-            None => compile(),
-        }
-        Self { compilation, label, groups: Mutex::default() }
+        let layout = pipeline.get_bind_group_layout(0);
+        Self { pipeline, layout, label, groups: Mutex::default() }
     }
 
     /// The bind group over these buffers, made anew only where it is not at hand: making one costs more than a dispatch.
@@ -160,8 +89,7 @@ impl Kernel {
             .iter()
             .map(|(binding, buffer)| wgpu::BindGroupEntry { binding: *binding, resource: buffer.binding() })
             .collect();
-        let descriptor =
-            wgpu::BindGroupDescriptor { label: Some(self.label), layout: &self.compilation.result().layout, entries: &entries };
+        let descriptor = wgpu::BindGroupDescriptor { label: Some(self.label), layout: &self.layout, entries: &entries };
         let group = gpu.device.create_bind_group(&descriptor);
         let made_of = bindings.iter().map(|(binding, buffer)| (*binding, Arc::downgrade(buffer.identity()))).collect();
         groups.push(Group { made_of, group: group.clone() });
@@ -170,7 +98,7 @@ impl Kernel {
 
     /// Runs with a size known on the host.
     pub fn dispatch(&self, gpu: &Gpu, pass: &mut wgpu::ComputePass<'_>, bindings: &[(u32, &GpuBuffer)], size: [u32; 3]) {
-        pass.set_pipeline(&self.compilation.result().pipeline);
+        pass.set_pipeline(&self.pipeline);
         pass.set_bind_group(0, &self.bind(gpu, bindings), &[]);
         gpu.mark(pass, self.label);
         gpu.traffic.dispatched();
@@ -185,7 +113,7 @@ impl Kernel {
         bindings: &[(u32, &GpuBuffer)],
         size: IndirectSize<'_>,
     ) {
-        pass.set_pipeline(&self.compilation.result().pipeline);
+        pass.set_pipeline(&self.pipeline);
         pass.set_bind_group(0, &self.bind(gpu, bindings), &[]);
         gpu.mark(pass, self.label);
         gpu.traffic.dispatched();
