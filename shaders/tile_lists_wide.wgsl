@@ -49,7 +49,9 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
             row = row_of(outline, outline.first_row + row_within(item, member));
             first_tiles[local] = row.first;
             row_gaussians[local] = gaussian;
-            atomicAdd(&tiles_found[member], row.count);
+            if setup.emit == 0u {
+                atomicAdd(&tiles_found[member], row.count);
+            }
         }
         tile_ends[local] = exclusive_sum(local, row.count) + row.count;
         let tiles_here = workgroupUniformLoad(&tile_ends[255]);

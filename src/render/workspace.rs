@@ -135,7 +135,7 @@ impl Workspace {
 
     pub(super) fn reserve_image(&mut self, gpu: &Gpu, pixels: u32, tiles: u32) -> Result<(), GpuError> {
         if tiles > self.tiles {
-            self.ranges = GpuBuffer::storage(gpu, "ranges", u64::from(tiles.next_multiple_of(2)) * 16)?;
+            self.ranges = GpuBuffer::storage(gpu, "ranges", u64::from(tiles) * 16)?;
             self.tiles = tiles;
         }
         if pixels > self.pixels {
