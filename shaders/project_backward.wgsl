@@ -1,8 +1,8 @@
 // Carries the intersections' gradients through the projection to each visible Gaussian's parameters.
 //
 // One invocation a visible Gaussian, in map order: neighbours' parameters lie side by side. A Gaussian's intersections do as well, and are summed
-// in order. `begin_gradient` and `store_gradient` are the sink: it steps Adam at once (`shared/sink_adam.wgsl`) or writes the gradient
-// down (`shared/sink_gradient.wgsl`).
+// in order. `is_wanted`, `begin_gradient` and `store_gradient` are the sink: it steps Adam at once (`shared/sink_adam.wgsl`) or writes the
+// gradient down (`shared/sink_gradient.wgsl`).
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<storage, read> counters: array<Counter>;
@@ -15,7 +15,10 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
     let item = linear_workgroup(workgroup) * 256u + local;
     // Without room for all intersections nothing was rendered: the step will be repeated.
     if item < counters[VISIBLE_COUNTER].count && counters[INTERSECTION_COUNTER].count > 0u {
-        backward(intersection_counts[3u * view.capacity + item]);
+        let i = intersection_counts[3u * view.capacity + item];
+        if is_wanted(i) {
+            backward(i);
+        }
     }
 }
 

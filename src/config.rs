@@ -5,7 +5,8 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use crate::export::MapFormat;
-use crate::mapping::MappingConfig;
+use crate::mapping::{ExposureConfig, MappingConfig, RefineConfig};
+use crate::partition::Region;
 use crate::sequence::{Layout, SensorKind};
 use crate::tracking::TrackingConfig;
 
@@ -26,6 +27,9 @@ pub struct Config {
     /// A map, or the folder of a run, that the map begins with; in the world of the known poses.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub initial_map: Option<PathBuf>,
+    /// A finished run to go on from: poses, exposures and the initial map are its own.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub refined: Option<RefinedConfig>,
     /// Keyframes mapped, and rounds of the refinement, between two checkpoints; none are kept where absent.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub checkpoint_every: Option<usize>,
@@ -54,6 +58,17 @@ pub struct SequenceConfig {
     pub camera: Option<String>,
 }
 
+/// What of a finished run is refined.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RefinedConfig {
+    /// Its folder.
+    pub run: PathBuf,
+    /// The part of its map that is refined, and all that the result holds; the whole map where absent.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub region: Option<Region>,
+}
+
 /// Which frames are replayed, and how fast.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -79,6 +94,7 @@ impl Default for Config {
             map_scale: 1.0,
             map_format: MapFormat::default(),
             initial_map: None,
+            refined: None,
             checkpoint_every: None,
             replay: ReplayConfig::default(),
             tracking: TrackingConfig::default(),
@@ -204,6 +220,29 @@ impl Config {
         Self { replay, mapping: MappingConfig::offline(), ..Self::default() }
     }
 
+    /// Settings to refine a finished run with: its own, but each keyframe only arrives, and poses and exposures stay as they are. A resolution is
+    /// the run's own.
+    ///
+    /// # Errors
+    /// [`ConfigError`] if the run's `config.toml` cannot be read.
+    pub fn refining(run: &Path) -> Result<Self, ConfigError> {
+        let run = std::path::absolute(run).unwrap_or_else(|_| run.into());
+        let config = Self::read(&run.join("config.toml"))?;
+        let replay = ReplayConfig { real_time: false, known_poses: true, ..config.replay };
+        let refine = RefineConfig { steps_per_keyframe: 0, seconds: None, ..config.mapping.refine };
+        let exposure = ExposureConfig { refinements: 0, ..config.mapping.exposure };
+        let mapping = MappingConfig {
+            iterations_per_keyframe: 0,
+            first_iterations: 0,
+            yields_to_keyframes: false,
+            refine,
+            exposure,
+            ..config.mapping
+        };
+        let refined = Some(RefinedConfig { run, region: None });
+        Ok(Self { initial_map: None, refined, checkpoint_every: None, replay, mapping, ..config })
+    }
+
     /// Reads and checks a TOML file; keys that it leaves out keep their defaults, unknown ones are errors. The defaults are those of
     /// [`Self::offline`] if the file says that poses are known.
     ///
@@ -289,6 +328,12 @@ impl Config {
         }
         if self.initial_map.is_some() && !self.replay.known_poses {
             return value("an initial map needs the world of known poses: use --known-poses (replay.known_poses), too".into());
+        }
+        if let Some(refined) = &self.refined {
+            if !self.replay.known_poses || self.initial_map.is_some() {
+                return value("a refined run has poses and map of its own: set replay.known_poses, and no initial_map".into());
+            }
+            refined.region.map_or(Ok(()), |region| region.validate()).map_err(|e| ConfigError::Value(format!("refined.{e}")))?;
         }
         if self.mapping.antialiased && !self.map_format.keeps_antialiasing() {
             let name = self.map_format.name();

@@ -17,6 +17,7 @@ pub mod jobs;
 pub mod mapping;
 pub mod mesh;
 pub mod optimise;
+pub mod partition;
 pub mod pipeline;
 pub mod presets;
 pub mod recording;

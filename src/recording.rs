@@ -98,7 +98,7 @@ impl Recording {
         config.replay.frames = config.replay.frames.map(|(start, end)| (start, end.min(recorded)));
         let recording = Self { sequence, config };
         recording.check_size()?;
-        if recording.config.replay.known_poses {
+        if recording.config.replay.known_poses && recording.config.refined.is_none() {
             recording.check_known_poses()?;
         }
         Ok(recording)

@@ -4,6 +4,7 @@ mod dataset;
 mod evaluate;
 mod mesh;
 mod mesh_errors;
+mod split;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -12,6 +13,7 @@ pub use dataset::{DatasetCounts, DatasetOptions, DatasetViews, export_dataset};
 pub use evaluate::{EvaluateOptions, evaluate_folder};
 pub use mesh::{FusedMesh, MapDepth, MeshOptions, mesh_folder};
 pub use mesh_errors::{MeshReport, MeshTruthOptions, evaluate_mesh};
+pub use split::{Cell, Split, SplitOptions, split_run};
 
 use crate::config::Config;
 use crate::evaluation::Metrics;
@@ -112,6 +114,12 @@ pub enum SessionError {
         /// The folder.
         folder: PathBuf,
     },
+    /// A run of whose map no keyframe sees anything.
+    #[error("no keyframe of {run} sees its map; give a run whose keyframes.txt and map belong together")]
+    NothingSeen {
+        /// The run's folder.
+        run: PathBuf,
+    },
     /// A run that would replace the map that it begins with.
     #[error("the initial map {map} lies in the folder of the results, where it would be replaced; choose another --out")]
     InitialMapInOut {
@@ -189,7 +197,8 @@ impl Session {
     /// If the recording cannot begin a map, or the folder cannot be written to or is in use.
     pub fn with_device(recording: Recording, gpu: Arc<Gpu>, out: &Path) -> Result<Self, SessionError> {
         check_first_frame(&recording)?;
-        if let Some(map) = &recording.config().initial_map {
+        let config = recording.config();
+        if let Some(map) = config.initial_map.as_ref().or(config.refined.as_ref().map(|refined| &refined.run)) {
             let place = |path: &Path| std::fs::canonicalize(path).ok();
             let folder = if map.is_dir() { Some(map.as_path()) } else { map.parent() };
             if place(out).is_some_and(|out| folder.and_then(place) == Some(out)) {
@@ -284,6 +293,17 @@ impl Session {
             }
             (Some(error), Err(then)) => Err(SessionError::EndedEarlyUnwritten { error, then: Box::new(then) }),
         }
+    }
+
+    /// Writes a replay that reached its end without measuring it.
+    ///
+    /// # Errors
+    /// If the replay ended early, or a result cannot be written.
+    pub fn write(&self, replay: Replay) -> Result<RunResult, SessionError> {
+        replay.error.map_or(Ok(()), Err)?;
+        outputs::write_results(&self.out, &self.recording, &replay.result)?;
+        outputs::remove_checkpoint(&self.out)?;
+        Ok(replay.result)
     }
 
     fn write_and_measure(&self, result: &RunResult, on_view: &dyn Fn(usize)) -> Result<Metrics, OutputError> {

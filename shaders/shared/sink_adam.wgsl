@@ -21,6 +21,8 @@ struct AdamSetup {
     color_settling: f32,
     // Least share that the present parameters have in their averages.
     least_share: f32,
+    // Gaussians before this place never move.
+    frozen: u32,
 }
 
 // The share after n steps is 1/(1 + n/this), but the least at least.
@@ -46,6 +48,10 @@ var<private> size: f32;
 
 // This view's sampling interval at the Gaussian, metres; 0 where the map is not antialiased.
 var<private> sampling_interval: f32;
+
+fn is_wanted(i: u32) -> bool {
+    return i >= adam.frozen;
+}
 
 // In the first moments, lane w of planes 1 and 3 counts the Gaussian's steps, of all and of its higher harmonics.
 fn begin_gradient(i: u32, interval: f32) {

@@ -110,7 +110,14 @@ fn keyframe(id: usize, bench: &HostBench) -> Keyframe {
         valid: None,
     };
     let world_from_camera = Se3::translation(0.02 * id as f64, 0.0, 0.0);
-    Keyframe { id, world_from_camera, image, depth_source: DepthSource::Sensor, covisible: (0..id).rev().take(5).collect() }
+    Keyframe {
+        id,
+        world_from_camera,
+        image,
+        depth_source: DepthSource::Sensor,
+        covisible: (0..id).rev().take(5).collect(),
+        exposure: None,
+    }
 }
 
 fn points(bench: &HostBench) -> Vec<KnownPoint> {

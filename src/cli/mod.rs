@@ -18,6 +18,7 @@ mod report;
 mod resume;
 mod run;
 mod source;
+mod split;
 mod stress;
 mod view;
 
@@ -80,6 +81,8 @@ enum Command {
     View(view::ViewArgs),
     /// Measure speed.
     Bench(bench::BenchArgs),
+    /// Plan the refinement of a finished run's map in parts, one task each, for `keysplat jobs`.
+    Split(split::SplitArgs),
     /// Run the tasks of a plan, on this machine or on a cluster, and merge their results.
     Jobs(jobs::JobsArgs),
     /// Try thousands of nasty cases against what is known of them.
@@ -139,6 +142,7 @@ fn execute(command: Command, verbosity: Verbosity) -> miette::Result<ExitCode> {
         Command::Render(args) => render::render(&args, verbosity),
         Command::View(args) => view::view(&args, verbosity),
         Command::Bench(args) => bench::bench(&args, verbosity),
+        Command::Split(args) => split::split(&args),
         Command::Stress(args) => stress::stress(&args),
         Command::Adapters => adapters::adapters(),
     }?;

@@ -57,6 +57,9 @@ pub struct RunArgs {
     /// poses.
     #[arg(long, value_name = "MAP")]
     initial_map: Option<PathBuf>,
+    /// Refine a finished run further, with its poses, exposures, map and settings. Its recording is that of the run unless it is named.
+    #[arg(long, value_name = "RUN", conflicts_with_all = ["config", "known_poses", "initial_map", "preset", "real_time", "map_scale"])]
+    refine: Option<PathBuf>,
     /// Part of the name of the adapter to use (see `keysplat adapters`).
     #[arg(long)]
     adapter: Option<String>,
@@ -140,7 +143,8 @@ impl RunArgs {
         let config = self.resolve(self.preset, None)?;
         let sequence = config.sequence.unwrap_or_default();
         let camera = sequence.camera.filter(|camera| is_camera_file(camera)).map(PathBuf::from);
-        let all = [Some(sequence.path), self.config.clone(), camera, config.initial_map];
+        let run = config.refined.map(|refined| refined.run);
+        let all = [Some(sequence.path), self.config.clone(), camera, config.initial_map, run];
         Ok(all.into_iter().flatten().collect())
     }
 
@@ -162,7 +166,7 @@ impl RunArgs {
     pub fn open(&self) -> miette::Result<(Recording, Arc<Gpu>)> {
         let recording = Recording::open(self.resolve(self.preset, None)?).into_diagnostic()?;
         let gpu = Gpu::open(recording.config().adapter.as_deref()).into_diagnostic()?;
-        let free = self.config.is_none();
+        let free = self.config.is_none() && self.refine.is_none();
         let preset = self.preset.or_else(|| (free && !self.known_poses).then(|| Preset::for_adapter(&gpu.adapter)));
         let scale = match self.preset {
             _ if self.map_scale.is_some() => None,
@@ -174,10 +178,11 @@ impl RunArgs {
 
     /// The configuration, with `scale` where no option gives the mapping resolution.
     fn resolve(&self, preset: Option<Preset>, scale: Option<f64>) -> miette::Result<Config> {
-        let mut config = match &self.config {
-            Some(path) => Config::read_with(path, self.known_poses).into_diagnostic()?,
-            None if self.known_poses => Config::offline(),
-            None => Config::default(),
+        let mut config = match (&self.config, &self.refine) {
+            (Some(path), _) => Config::read_with(path, self.known_poses).into_diagnostic()?,
+            (None, Some(run)) => Config::refining(run).into_diagnostic()?,
+            (None, None) if self.known_poses => Config::offline(),
+            (None, None) => Config::default(),
         };
         if let Some(preset) = preset {
             preset.apply(&mut config);
@@ -185,7 +190,8 @@ impl RunArgs {
         if let Some(path) = &self.sequence {
             // Absolute, so that the written configuration finds it from anywhere.
             let path = std::path::absolute(path).into_diagnostic()?;
-            config.sequence = Some(SequenceConfig { path, ..SequenceConfig::default() });
+            let of_run = config.sequence.filter(|_| self.refine.is_some()).unwrap_or_default();
+            config.sequence = Some(SequenceConfig { path, ..of_run });
         }
         let sequence = config
             .sequence

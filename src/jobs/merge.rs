@@ -7,7 +7,7 @@ use serde::Serialize;
 
 use super::slurm::SlurmState;
 use super::task::{TaskResult, failure, result_folder};
-use super::{JobError, Plan, Work};
+use super::{JobError, Plan, Work, cells};
 use crate::evaluation::{Metrics, sha256_hex};
 use crate::files::write_atomically;
 use crate::report::replays::{self, ReplayRow};
@@ -44,7 +44,7 @@ pub struct Merge {
     pub table: String,
 }
 
-/// Verifies all results and writes the table of `bench sweep` or `bench track`, and `merge.json`, into the plan's folder. `engine` has the
+/// Verifies all results and writes the table of `bench sweep` or `bench track`, or the map of all cells, and `merge.json`, into the plan's folder. `engine` has the
 /// states that an engine reports.
 ///
 /// # Errors
@@ -87,10 +87,11 @@ fn write_tables(plan: &Plan, done: &[usize], holes: &[Hole]) -> Result<String, J
                 runs.push(SweepRow::new(&run.sequence, &run.variant, task.seed, &metrics));
                 last = Some(metrics);
             }
+            Work::Cell(_) => {}
             Work::Replay(_) => replays.push(read::<ReplayRow>(&folder.join(ReplayRow::FILE))?),
         }
     }
-    let mut table = String::new();
+    let mut table = cells::merge(plan, done)?;
     if let Some(metrics) = last {
         let holes = holes.iter().map(Hole::to_string).collect();
         table += &sweep::write(plan.folder(), &Sweep::of(runs, &metrics, holes))?;
@@ -101,7 +102,7 @@ fn write_tables(plan: &Plan, done: &[usize], holes: &[Hole]) -> Result<String, J
     Ok(table)
 }
 
-fn read<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T, JobError> {
+pub(super) fn read<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T, JobError> {
     let text = std::fs::read(path).map_err(|source| JobError::Read { path: path.into(), source })?;
     let damaged = |error: serde_json::Error| {
         let advice = "remove the folder and run its task again";

@@ -4,6 +4,7 @@
 //! matters is in the program: a task verifies its inputs, resumes, and appears whole or not at all. An engine only starts processes, so each
 //! has one file here: processes of this machine, Slurm, Kubernetes. There is no scheduler and no network here.
 
+mod cells;
 mod input;
 pub mod kubernetes;
 pub mod local;
@@ -17,9 +18,10 @@ mod tests;
 
 use std::path::PathBuf;
 
+pub use cells::CellRow;
 pub use input::Input;
 pub use merge::{Hole, Merge, merge};
-pub use plan::{Draft, Plan, ReplayTask, RunTask, Task, Work};
+pub use plan::{CellTask, Draft, Plan, ReplayTask, RunTask, Task, Work};
 pub use status::{State, TaskStatus, digest, status, to_table};
 pub use task::{Ended, Made, TaskResult, WorkError, run_task};
 

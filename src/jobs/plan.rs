@@ -8,6 +8,7 @@ use super::input::create_folder;
 use super::{Input, JobError};
 use crate::evaluation::sha256_hex;
 use crate::files::write_durably;
+use crate::partition::Region;
 use crate::sequence::SensorKind;
 
 /// Version of the format.
@@ -56,6 +57,22 @@ pub enum Work {
     Run(RunTask),
     /// A replay by the tracker: one row of `bench track`.
     Replay(ReplayTask),
+    /// The refinement of one cell of a large map.
+    Cell(CellTask),
+}
+
+/// Arguments of a cell's refinement.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CellTask {
+    /// Folder of the run; a relative path begins at the plan's folder.
+    pub run: PathBuf,
+    /// The recording; a relative path begins at the plan's folder.
+    pub recording: PathBuf,
+    /// The cell.
+    pub region: Region,
+    /// Options of `keysplat run --refine`.
+    pub options: Vec<String>,
 }
 
 /// Arguments of a run.

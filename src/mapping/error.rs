@@ -24,6 +24,14 @@ pub enum MappingError {
         /// The keyframe.
         id: KeyframeId,
     },
+    /// A region with its context does not fit.
+    #[error(
+        "the adapter has no room for the {gaussians} Gaussians of the region and its context; split the run into smaller cells"
+    )]
+    NoRoom {
+        /// Their number.
+        gaussians: usize,
+    },
     /// Images that left the GPU cannot be read back.
     #[error(
         "cannot read the images of earlier keyframes back from the temporary folder ({0}); raise --max-host-memory, or set TMPDIR to another folder"

@@ -199,7 +199,14 @@ mod tests {
         let (width, height) = color.dimensions();
         let pinhole = Pinhole { fx: 30.0, fy: 30.0, cx: 15.5, cy: 11.5, width, height };
         let image = RectifiedImage { pinhole, color, depth: Some(DepthImage { width, height, metres }), valid: None };
-        Keyframe { id: 0, world_from_camera: Se3::identity(), image, depth_source: DepthSource::Sensor, covisible: vec![] }
+        Keyframe {
+            id: 0,
+            world_from_camera: Se3::identity(),
+            image,
+            depth_source: DepthSource::Sensor,
+            covisible: vec![],
+            exposure: None,
+        }
     }
 
     #[test]

@@ -31,6 +31,8 @@ pub struct Keyframe {
     pub depth_source: DepthSource,
     /// Earlier keyframes that see the same landmarks, strongest first.
     pub covisible: Vec<KeyframeId>,
+    /// Exposure against the map's, where that is known: of a finished run, whose map has Gaussians for all that it shows.
+    pub exposure: Option<Exposure>,
 }
 
 impl Keyframe {

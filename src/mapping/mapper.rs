@@ -133,6 +133,12 @@ impl Mapper {
         let keyframe = self.timed("depth", |mapper| mapper.sweep(keyframe)).map_or(Cow::Borrowed(keyframe), Cow::Owned);
         // Before its insertion: a bound on memory leaves to it what the image has left.
         let mut mapped = self.timed("image", |mapper| mapper.upload(&keyframe))?;
+        if let Some(exposure) = keyframe.exposure {
+            mapped.exposure = exposure;
+            self.keyframes.push(mapped);
+            self.limit_gpu_images()?;
+            return Ok(KeyframeReport { id: keyframe.id, gaussians: self.cloud.len(), exposure, ..KeyframeReport::default() });
+        }
         let config = self.config.clone();
         let (candidates, survey) = std::thread::scope(|scope| {
             let candidates = scope.spawn(|| Candidates::new(&keyframe.image, &config.insertion));

@@ -15,13 +15,22 @@ pub enum MapperMessage {
     /// Scene points of the recording, before the first keyframe.
     Points(Vec<KnownPoint>),
     /// A map that others made, before the first keyframe.
-    Map(Arc<GaussianCloud>),
+    Map(InitialMap),
     /// A new keyframe with its image.
     Keyframe(Box<Keyframe>),
     /// New poses of earlier keyframes after bundle adjustment or a loop closure.
     PoseUpdate(Vec<PoseUpdate>),
     /// Keyframes of submaps that never joined the largest one, after the last frame.
     Remove(Vec<KeyframeId>),
+}
+
+/// The map that a run begins with.
+#[derive(Clone, Debug)]
+pub struct InitialMap {
+    /// Its Gaussians, in the keyframes' world.
+    pub cloud: Arc<GaussianCloud>,
+    /// So many of them, the first ones, are rendered and never change.
+    pub frozen: usize,
 }
 
 /// New pose of an earlier keyframe.

@@ -26,7 +26,7 @@ pub use host_time::HostTimes;
 pub use keyframe::{DepthSource, Keyframe, RightImage};
 pub use limits::LimitsConfig;
 pub use mapper::{FinalRefinement, Interlude, KeyframeReport, Mapper, MapperState, RefineReport};
-pub use message::{MapperMessage, PoseUpdate};
+pub use message::{InitialMap, MapperMessage, PoseUpdate};
 pub use plane_sweep::PlaneSweepConfig;
 
 /// Index of a keyframe in the order of tracking; unique and ascending.

@@ -104,8 +104,9 @@ impl AdamConfig {
         }
     }
 
-    /// The GPU's copy for step number `step` of the map. The shortest axis shrinks to the `thickness`, in units of the second.
-    pub(super) fn setup(&self, step: usize, thickness: Option<f32>) -> AdamSetup {
+    /// The GPU's copy for step number `step` of the map. The shortest axis shrinks to the `thickness`, in units of the second; the first `frozen`
+    /// Gaussians never move.
+    pub(super) fn setup(&self, step: usize, thickness: Option<f32>, frozen: usize) -> AdamSetup {
         let p = self.lr_position;
         let rates = [
             [p, p, p, self.lr_opacity],
@@ -127,7 +128,8 @@ impl AdamConfig {
             log_thickness: thickness.map_or(f32::MAX, f32::ln),
             color_settling: if self.color_settling_steps > 0.0 { 1.0 / self.color_settling_steps } else { 0.0 },
             least_share: 1.0 / self.ema_steps,
-            pad: [0.0; 2],
+            frozen: frozen as u32,
+            pad: 0.0,
         }
     }
 }

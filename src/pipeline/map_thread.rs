@@ -308,7 +308,14 @@ mod tests {
         let pinhole = Pinhole { fx: 8.0, fy: 8.0, cx: 3.5, cy: 3.5, width: 8, height: 8 };
         let image = RectifiedImage { pinhole, color: RgbImage::new(8, 8), depth: None, valid: None };
         let world_from_camera = Se3::identity();
-        let keyframe = Keyframe { id: 0, world_from_camera, image, depth_source: DepthSource::Sensor, covisible: Vec::new() };
+        let keyframe = Keyframe {
+            id: 0,
+            world_from_camera,
+            image,
+            depth_source: DepthSource::Sensor,
+            covisible: Vec::new(),
+            exposure: None,
+        };
         MapperMessage::Keyframe(Box::new(keyframe))
     }
 

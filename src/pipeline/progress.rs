@@ -78,6 +78,17 @@ pub enum PipelineError {
         /// The file.
         path: PathBuf,
     },
+    /// A file of the run to be refined cannot be used.
+    #[error("cannot refine the run: {path} {reason}; give the folder of a run of this recording")]
+    RefinedRun {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// No keyframe sees the region to be refined.
+    #[error("no keyframe of the run sees the region; give one in which its cameras see Gaussians")]
+    NotSeen,
     /// A resumed run was stopped before it reached its checkpoint.
     #[error("the run ended before it had caught up with {checkpoint}, which is kept; resume it again")]
     NotCaughtUp {

@@ -38,18 +38,19 @@ pub(super) struct ReadSummary {
 pub(super) struct ReadThread<'a> {
     sequence: &'a Sequence,
     front_end: Option<FrontEnd>,
+    frames: Vec<usize>,
     real_time: bool,
     sender: &'a Sender<QueuedFrame>,
     progress: &'a Progress,
 }
 
 impl<'a> ReadThread<'a> {
-    /// The frames of a recording, with features unless its poses are known.
-    pub fn new(recording: &'a Recording, sender: &'a Sender<QueuedFrame>, progress: &'a Progress) -> Self {
+    /// These frames of a recording, with features unless its poses are known.
+    pub fn new(recording: &'a Recording, frames: Vec<usize>, sender: &'a Sender<QueuedFrame>, progress: &'a Progress) -> Self {
         let (sequence, config) = (recording.sequence(), recording.config());
         let front_end = || FrontEnd::new(sequence.camera, sequence.sensor, &config.tracking);
         let front_end = (!config.replay.known_poses).then(front_end);
-        Self { sequence, front_end, real_time: config.replay.real_time, sender, progress }
+        Self { sequence, front_end, frames, real_time: config.replay.real_time, sender, progress }
     }
 
     /// Sends every readable frame, in order. Real-time replay waits for each frame's timestamp and never blocks on the tracker.
@@ -66,7 +67,7 @@ impl<'a> ReadThread<'a> {
             (!is_late).then(|| QueuedFrame { extracted: self.front_end.as_ref().map(|f| f.extract(&frame)), frame })
         };
         let ahead = rayon::current_num_threads().min(MOST_AT_ONCE);
-        self.sequence.read_ahead(0..self.sequence.entries.len(), ahead, prepare, |index, loaded| {
+        self.sequence.read_ahead(self.frames.iter().copied(), ahead, prepare, |index, loaded| {
             let queued = match loaded {
                 Ok(Some(queued)) => queued,
                 Ok(None) => {
@@ -126,7 +127,7 @@ mod tests {
         progress: &'a Progress,
     ) -> ReadThread<'a> {
         let front_end = Some(FrontEnd::new(sequence.camera, sequence.sensor, &TrackingConfig::default()));
-        ReadThread { sequence, front_end, real_time, sender, progress }
+        ReadThread { sequence, front_end, frames: (0..FRAMES).collect(), real_time, sender, progress }
     }
 
     #[test]

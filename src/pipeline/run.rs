@@ -80,7 +80,11 @@ pub fn run(
             .map_err(spawn_error("tracking"))?;
         let read = Builder::new()
             .name("reading".into())
-            .spawn_scoped(scope, move || ReadThread::new(recording, &frame_sender, progress).read())
+            .spawn_scoped(scope, move || {
+                let all = || (0..recording.sequence().entries.len()).collect();
+                let frames = scene.as_ref().map_or_else(all, Scene::frames);
+                ReadThread::new(recording, frames, &frame_sender, progress).read()
+            })
             .map_err(spawn_error("reading"))?;
         Ok::<_, PipelineError>((join("reading", read), join("tracking", track), join("mapping", map)))
     })?;
@@ -92,7 +96,11 @@ pub fn run(
         return Err(cause.or(error).expect("a run that falls behind has an error"));
     }
     elapsed.wall_s += started.elapsed().as_secs_f64();
-    Ok(Replay { stopped: progress.stopped(), ..gather(recording, elapsed, read, track, map) })
+    let mut replay = Replay { stopped: progress.stopped(), ..gather(recording, elapsed, read, track, map) };
+    if let Some(scene) = scene {
+        replay.result.cloud = scene.result_of(replay.result.cloud);
+    }
+    Ok(replay)
 }
 
 fn join<T>(thread: &'static str, handle: ScopedJoinHandle<'_, T>) -> Result<T, PipelineError> {

@@ -191,7 +191,7 @@ impl TrackThread<'_> {
             depth_source = DepthSource::Landmarks { right: right_image(rectifier, self.recording.sequence().sensor, frame) };
         }
         let covisible = covisible.into_iter().map(|(id, _)| id).collect();
-        let keyframe = Keyframe { id, world_from_camera, image, depth_source, covisible };
+        let keyframe = Keyframe { id, world_from_camera, image, depth_source, covisible, exposure: None };
         keyframes.send(MapperMessage::Keyframe(Box::new(keyframe)))
     }
 }
@@ -275,7 +275,8 @@ mod tests {
         let depth = DepthImage { width: 8, height: 8, metres: vec![2.0; 64] };
         let image = RectifiedImage { pinhole, color: RgbImage::new(8, 8), depth: Some(depth), valid: None };
         let depth_source = DepthSource::Landmarks { right: None };
-        let keyframe = Keyframe { id, world_from_camera: Se3::identity(), image, depth_source, covisible: Vec::new() };
+        let keyframe =
+            Keyframe { id, world_from_camera: Se3::identity(), image, depth_source, covisible: Vec::new(), exposure: None };
         MapperMessage::Keyframe(Box::new(keyframe))
     }
 

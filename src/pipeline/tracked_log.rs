@@ -60,7 +60,10 @@ impl<'a> TrackedLog<'a> {
             let frames = frames;
             Builder::new()
                 .name("reading".into())
-                .spawn_scoped(scope, move || ReadThread::new(recording, &frame_sender, progress).read())
+                .spawn_scoped(scope, move || {
+                    let frames = (0..recording.sequence().entries.len()).collect();
+                    ReadThread::new(recording, frames, &frame_sender, progress).read()
+                })
                 .map_err(|source| PipelineError::Spawn { thread: "reading", source })?;
             let thread = TrackThread { recording, frames: &frames, mapper: &message_sender, progress };
             Ok::<_, PipelineError>(scene.as_ref().map_or_else(|| thread.track(), |scene| known_poses::follow(&thread, scene)))

@@ -42,6 +42,8 @@ pub struct GpuCloud {
     sh_degree: ShDegree,
     antialiased: bool,
     count: usize,
+    /// So many of the first ones never change.
+    frozen: usize,
     capacity: usize,
     /// The most that there may be, if that is limited.
     limit: Option<usize>,
@@ -67,6 +69,7 @@ pub struct GpuCloud {
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct CloudState {
     capacity: usize,
+    frozen: usize,
     limit: Option<usize>,
     room: Option<usize>,
     rounds: u32,
@@ -90,6 +93,7 @@ impl GpuCloud {
             sh_degree,
             antialiased: false,
             count: 0,
+            frozen: 0,
             capacity,
             limit: None,
             room: None,
@@ -135,6 +139,16 @@ impl GpuCloud {
     /// Whether there are no Gaussians.
     pub fn is_empty(&self) -> bool {
         self.count == 0
+    }
+
+    /// The first `count` Gaussians are rendered, but no step moves them from now on; whoever makes a plan must keep to it.
+    pub fn freeze(&mut self, count: usize) {
+        self.frozen = count;
+    }
+
+    /// Number of Gaussians, the first ones, that never change.
+    pub fn frozen(&self) -> usize {
+        self.frozen
     }
 
     /// Gaussians that the buffers have space for.
@@ -290,8 +304,8 @@ impl GpuCloud {
             let read = gpu.read(None, &self.parts(buffer).collect::<Vec<_>>())?;
             (0..self.planes()).for_each(|plane| values.extend(read.part::<[f32; 4]>(plane)));
         }
-        let Self { capacity, limit, room, rounds, .. } = *self;
-        Ok(CloudState { capacity, limit, room, rounds, values, histories: self.histories.read(gpu, 0, self.count)? })
+        let Self { capacity, frozen, limit, room, rounds, .. } = *self;
+        Ok(CloudState { capacity, frozen, limit, room, rounds, values, histories: self.histories.read(gpu, 0, self.count)? })
     }
 
     /// The map of a state, to the bit; `None` if that is no map of this degree.
@@ -301,11 +315,15 @@ impl GpuCloud {
     pub fn restore(gpu: &Gpu, sh_degree: ShDegree, state: &CloudState) -> Result<Option<Self>, GpuError> {
         let planes = planes(sh_degree);
         let count = state.values.len() / (BUFFERS * planes);
-        if state.values.len() != BUFFERS * planes * count || state.capacity < count || state.histories.len() != count {
+        if state.values.len() != BUFFERS * planes * count
+            || state.capacity < count.max(state.frozen)
+            || state.histories.len() != count
+        {
             return Ok(None);
         }
         let mut cloud = Self::new(gpu, sh_degree, state.capacity)?;
-        (cloud.count, cloud.limit, cloud.room, cloud.rounds) = (count, state.limit, state.room, state.rounds);
+        (cloud.count, cloud.frozen, cloud.limit, cloud.room, cloud.rounds) =
+            (count, state.frozen, state.limit, state.room, state.rounds);
         cloud.histories.write(gpu, 0, &state.histories);
         let buffers = cloud.buffers();
         for (i, plane) in state.values.chunks_exact(count.max(1)).enumerate() {

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-use crate::mapping::MapperMessage;
+use crate::mapping::{InitialMap, MapperMessage};
 
 /// Running SHA-256 over the messages so far.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -23,7 +23,8 @@ impl MessageDigest {
                 digest.update(bytemuck::cast_slice(point.position.as_slice()));
                 digest.update(point.color);
             }),
-            MapperMessage::Map(map) => {
+            MapperMessage::Map(InitialMap { cloud: map, frozen }) => {
+                digest.update(plain(frozen));
                 [&map.means, &map.log_scales, &map.sh].into_iter().for_each(|values| digest.update(bytemuck::cast_slice(values)));
                 digest.update(bytemuck::cast_slice(&map.rotations));
                 digest.update(bytemuck::cast_slice(&map.raw_opacities));
@@ -35,6 +36,7 @@ impl MessageDigest {
                 digest.update(plain(&(keyframe.id, keyframe.world_from_camera, &keyframe.covisible, image.pinhole)));
                 digest.update(image.color.as_raw());
                 image.valid.iter().for_each(|valid| digest.update(bytemuck::cast_slice::<bool, u8>(valid)));
+                digest.update(plain(&keyframe.exposure));
                 image.depth.iter().for_each(|depth| digest.update(bytemuck::cast_slice(&depth.metres)));
             }
         }

@@ -232,6 +232,15 @@ impl Sequence {
         self.entries[index].camera.as_ref().unwrap_or(&self.camera)
     }
 
+    /// The frame nearest in time, of two the earlier, if it is no further away than `max_difference_s`.
+    pub fn nearest(&self, timestamp_s: f64, max_difference_s: f64) -> Option<usize> {
+        let after = self.entries.partition_point(|entry| entry.timestamp_s < timestamp_s);
+        let near = after.saturating_sub(1)..(after + 1).min(self.entries.len());
+        let distances = near.map(|i| (i, (self.entries[i].timestamp_s - timestamp_s).abs()));
+        let nearest = distances.min_by(|a, b| a.1.total_cmp(&b.1))?;
+        (nearest.1 <= max_difference_s).then_some(nearest.0)
+    }
+
     /// Whether frames are loaded in any order at the same cost.
     pub fn has_random_access(&self) -> bool {
         self.video.is_none()

@@ -30,6 +30,18 @@ impl RectifiedImage {
         self.valid.as_ref().is_none_or(|valid| valid[i])
     }
 
+    /// Takes all pixels as not recorded but the given ones, `[height * width]`.
+    pub fn restrict(&mut self, to: &Arc<[bool]>) {
+        let valid: Arc<[bool]> = match &self.valid {
+            Some(valid) => valid.iter().zip(&**to).map(|(a, b)| *a && *b).collect(),
+            None => to.clone(),
+        };
+        if let Some(depth) = &mut self.depth {
+            depth.metres.iter_mut().zip(&*valid).filter(|(_, valid)| !**valid).for_each(|(metres, _)| *metres = 0.0);
+        }
+        self.valid = Some(valid);
+    }
+
     /// Median of the measured depths, metres; `None` if nothing was measured.
     pub fn median_depth_metres(&self) -> Option<f64> {
         let measured = self.depth.iter().flat_map(|depth| depth.metres.iter().copied().filter(|z| *z > 0.0));

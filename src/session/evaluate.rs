@@ -8,7 +8,7 @@ use crate::config::Config;
 use crate::evaluation::trajectory::MAX_TIME_DIFFERENCE_S;
 use crate::evaluation::{Exposures, Metrics, machine, sha256_hex, write_json};
 use crate::export::MapFormat;
-use crate::geometry::{Se3, Trajectory};
+use crate::geometry::{Se3, StampedPose, Trajectory};
 use crate::gpu::Gpu;
 use crate::recording::{Recording, RecordingError};
 use crate::run_folder::OutputError;
@@ -98,16 +98,8 @@ pub(super) fn read_trajectory(path: &Path) -> Result<Trajectory, SessionError> {
 
 /// The frame nearest in time to each pose, and the pose.
 pub(super) fn nearest_frames(sequence: &Sequence, trajectory: &Trajectory) -> Vec<(usize, Se3)> {
-    let entries = &sequence.entries;
-    let nearest = |t: f64| {
-        let after = entries.partition_point(|e| e.timestamp_s < t);
-        let candidates = after.saturating_sub(1)..(after + 1).min(entries.len());
-        candidates
-            .map(|i| (i, (entries[i].timestamp_s - t).abs()))
-            .min_by(|a, b| a.1.total_cmp(&b.1))
-            .filter(|(_, difference)| *difference <= MAX_TIME_DIFFERENCE_S)
-    };
-    trajectory.poses.iter().filter_map(|pose| Some((nearest(pose.timestamp_s)?.0, pose.world_from_camera))).collect()
+    let nearest = |pose: &StampedPose| Some((sequence.nearest(pose.timestamp_s, MAX_TIME_DIFFERENCE_S)?, pose.world_from_camera));
+    trajectory.poses.iter().filter_map(nearest).collect()
 }
 
 /// Exposures of the run, if it estimated any.

@@ -9,13 +9,14 @@ use std::path::{Path, PathBuf};
 const EVERYTHING_ABOVE: &[&str] = &["*"];
 
 /// A module, and the modules whose items it may name. `verification` is in no list but the command line's: production does not use the oracle.
-const ALLOWED: [(&str, &[&str]); 27] = [
+const ALLOWED: [(&str, &[&str]); 28] = [
     ("files", &[]),
     ("geometry", &[]),
     ("sequence", &["geometry"]),
     ("mesh", &["files", "geometry"]),
     ("synthetic", &["geometry", "mesh"]),
     ("splat", &["geometry"]),
+    ("partition", &["geometry", "splat"]),
     ("tracking", &["geometry", "sequence"]),
     ("gpu", &[]),
     ("render", &["geometry", "splat", "gpu"]),
@@ -26,7 +27,7 @@ const ALLOWED: [(&str, &[&str]); 27] = [
     ("evaluation", &["files", "geometry", "sequence", "splat", "gpu", "render"]),
     ("film", &["files", "geometry"]),
     ("inspection", &["geometry", "sequence", "tracking", "evaluation"]),
-    ("config", &["sequence", "tracking", "mapping", "export"]),
+    ("config", &["sequence", "tracking", "mapping", "export", "partition"]),
     ("recording", &["geometry", "sequence", "evaluation", "config"]),
     ("presets", &["gpu", "render", "calibration", "config", "recording"]),
     (
@@ -48,6 +49,7 @@ const ALLOWED: [(&str, &[&str]); 27] = [
             "config",
             "recording",
             "run_folder",
+            "partition",
         ],
     ),
     (
@@ -68,7 +70,7 @@ const ALLOWED: [(&str, &[&str]); 27] = [
         ],
     ),
     ("report", &["files", "evaluation", "run_folder", "viewing"]),
-    ("jobs", &["files", "sequence", "evaluation", "run_folder", "report"]),
+    ("jobs", &["files", "geometry", "sequence", "splat", "export", "evaluation", "run_folder", "report", "partition"]),
     (
         "session",
         &[
@@ -85,6 +87,7 @@ const ALLOWED: [(&str, &[&str]); 27] = [
             "pipeline",
             "mesh",
             "render",
+            "partition",
         ],
     ),
     ("verification", &["geometry", "sequence", "splat", "tracking", "gpu", "render", "optimise"]),
@@ -95,7 +98,8 @@ const ALLOWED: [(&str, &[&str]); 27] = [
 const OF_THE_WHOLE_RUN: [&str; 4] = ["config", "run_folder", "pipeline", "cli"];
 
 /// Modules that must build and run without a GPU.
-const WITHOUT_WGPU: [&str; 8] = ["files", "geometry", "sequence", "mesh", "synthetic", "splat", "tracking", "export"];
+const WITHOUT_WGPU: [&str; 9] =
+    ["files", "geometry", "sequence", "mesh", "synthetic", "splat", "partition", "tracking", "export"];
 
 const MAX_LINES: usize = 400;
 

@@ -6,9 +6,9 @@ use std::sync::Arc;
 use image::{Rgb, RgbImage};
 use keysplat::geometry::{Pinhole, Se3};
 use keysplat::gpu::Gpu;
-use keysplat::mapping::{DepthSource, Keyframe, KeyframeReport, Mapper, MapperState, MappingConfig, PoseUpdate};
+use keysplat::mapping::{DepthSource, InitialMap, Keyframe, KeyframeReport, Mapper, MapperState, MappingConfig, PoseUpdate};
 use keysplat::sequence::{DepthImage, RectifiedImage};
-use keysplat::splat::{Exposure, ShDegree};
+use keysplat::splat::{Exposure, Gaussian, ShDegree, unit_rotation};
 
 const PINHOLE: Pinhole = Pinhole { fx: 60.0, fy: 60.0, cx: 31.5, cy: 23.5, width: 64, height: 48 };
 
@@ -18,7 +18,7 @@ pub fn keyframe(id: usize, with_depth: bool) -> Keyframe {
     let depth = with_depth.then(|| DepthImage { width, height, metres: vec![2.0; (width * height) as usize] });
     let image = RectifiedImage { pinhole: PINHOLE, color, depth, valid: None };
     let world_from_camera = Se3::translation(0.01 * id as f64, 0.0, 0.0);
-    Keyframe { id, world_from_camera, image, depth_source: DepthSource::Sensor, covisible: Vec::new() }
+    Keyframe { id, world_from_camera, image, depth_source: DepthSource::Sensor, covisible: Vec::new(), exposure: None }
 }
 
 #[test]
@@ -262,4 +262,38 @@ fn the_final_epochs_draw_each_keyframe_as_often() {
         while mapper.refine(&mut refinement, &|| false).unwrap().is_some() {}
         assert_eq!(mapper.step_times().len() - before, expected, "at least {least}");
     }
+}
+
+/// Density control would remove every Gaussian, and the steps move all that may be moved.
+#[test]
+fn what_is_frozen_never_changes_and_known_keyframes_insert_nothing() {
+    let Some(gpu) = adapter() else { return };
+    let mut config = MappingConfig { first_iterations: 10, iterations_per_keyframe: 5, ..Default::default() };
+    let mut run = Mapper::new(gpu.clone(), &config).unwrap();
+    for id in 0..3 {
+        run.insert(&keyframe(id, true), &|| false).unwrap();
+    }
+    let cloud = Arc::new(run.download().unwrap());
+    let frozen = cloud.len() / 2;
+    (config.density.min_opacity, config.refine.steps, config.refine.density_every) = (0.99, 60, 20);
+    let mut mapper = Mapper::new(gpu.clone(), &config).unwrap();
+    mapper.add_map(&InitialMap { cloud: cloud.clone(), frozen }, 0).unwrap();
+    for id in 0..3 {
+        // Brighter than the map: there is something to learn.
+        let known = Keyframe { exposure: Some(Exposure([0.5; 3])), ..keyframe(id, true) };
+        let report = mapper.insert(&known, &|| false).unwrap();
+        assert_eq!((report.inserted, report.iterations, report.exposure), (0, 0, Exposure([0.5; 3])));
+    }
+    let state = mapper.state(None).unwrap();
+    assert_eq!(Mapper::restore(gpu, &config, &state).unwrap().map().frozen(), frozen);
+    let mut refinement = mapper.begin_refinement().unwrap();
+    while mapper.refine(&mut refinement, &|| false).unwrap().is_some() {}
+    let after = mapper.download().unwrap();
+    assert!((frozen..cloud.len()).contains(&after.len()), "{} of {}", after.len(), cloud.len());
+    // A map that begins a run has unit rotations.
+    let unit = |i: usize| Gaussian { rotation: unit_rotation(cloud.rotations[i]), ..cloud.get(i) };
+    for i in 0..frozen {
+        assert_eq!(after.get(i), unit(i), "{i}");
+    }
+    assert!((frozen..after.len()).all(|i| after.get(i) != unit(i)));
 }

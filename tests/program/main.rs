@@ -4,6 +4,7 @@
 mod common;
 
 mod bad_input;
+mod cells;
 mod check;
 mod datasets;
 mod end_to_end;

@@ -4,10 +4,11 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use clap::Parser;
-use keysplat::jobs::{JobError, Made, Plan, ReplayTask, RunTask, Task, Work, WorkError};
+use keysplat::jobs::{CellRow, CellTask, JobError, Made, Plan, ReplayTask, RunTask, Task, Work, WorkError};
+use keysplat::pipeline::Replay;
 use keysplat::report::replays::ReplayRow;
 use keysplat::report::sweep::SweepRow;
-use keysplat::run_folder::outputs;
+use keysplat::run_folder::{OutputError, outputs};
 use keysplat::{Progress, Session, SessionError};
 use miette::IntoDiagnostic;
 
@@ -92,8 +93,16 @@ pub fn work(plan: &Plan, task: &Task, folder: &Path, signals: &Signals, verbosit
     match &task.work {
         Work::Run(run) => {
             let recording = plan.folder().join(&run.recording);
-            let replayed = Replayed { run, seed: task.seed, recording: &recording, folder, signals, verbosity };
-            replayed.make()
+            let replayed = Replayed { recording: &recording, options: run.options.clone(), folder, signals, verbosity };
+            replayed.make(&|session, replay| session.finish(replay, &|_views| ()).map(drop))?;
+            measured(run, task.seed, folder)
+        }
+        Work::Cell(cell) => {
+            let recording = plan.folder().join(&cell.recording);
+            let options = options_of_cell(plan, cell).map_err(failed)?;
+            let replayed = Replayed { recording: &recording, options, folder, signals, verbosity };
+            replayed.make(&|session, replay| write_cell(session, replay, folder))?;
+            refined(folder)
         }
         Work::Replay(replay) => {
             let recording = plan.folder().join(&replay.recording);
@@ -120,34 +129,37 @@ fn write_replay(task: &ReplayTask, folder: &Path, signals: &Signals) -> Result<M
 
 /// A whole run in a task's folder.
 struct Replayed<'a> {
-    run: &'a RunTask,
-    seed: u64,
     recording: &'a Path,
+    options: Vec<String>,
     folder: &'a Path,
     signals: &'a Signals,
     verbosity: Verbosity,
 }
 
+/// Writes the results of a replay that reached its end.
+type Finish<'a> = &'a dyn Fn(&Session, Replay) -> Result<(), SessionError>;
+
 impl Replayed<'_> {
-    fn make(&self) -> Result<Made, WorkError> {
-        let done = match self.resume() {
+    /// Runs to the end, from a checkpoint if there is one.
+    fn make(&self, finish: Finish<'_>) -> Result<(), WorkError> {
+        let done = match self.resume(finish) {
             Ok(Some(done)) => done,
             Err(error @ (SessionError::Output(_) | SessionError::Gpu(_))) => return Err(failed(error)),
             nothing => {
                 // Of another adapter, for example: a result is that of one adapter.
                 nothing.err().iter().for_each(|error| tracing::warn!("{error}; the task begins anew"));
-                self.finish(self.begin()?).map_err(of_session)?
+                self.finish(self.begin()?, finish).map_err(of_session)?
             }
         };
-        if done { self.made() } else { Err(WorkError::Interrupted) }
+        if done { Ok(()) } else { Err(WorkError::Interrupted) }
     }
 
     /// Goes on from a checkpoint, if there is one; whether the run reached its end.
-    fn resume(&self) -> Result<Option<bool>, SessionError> {
+    fn resume(&self, finish: Finish<'_>) -> Result<Option<bool>, SessionError> {
         if !self.folder.join(outputs::CHECKPOINT).exists() {
             return Ok(None);
         }
-        match Session::resume(self.folder, Some(self.recording)).and_then(|session| self.finish(session)) {
+        match Session::resume(self.folder, Some(self.recording)).and_then(|session| self.finish(session, finish)) {
             // It stopped before it reached its checkpoint, which stays.
             Err(_) if self.signals.is_leaving() => Ok(Some(false)),
             ended => ended.map(Some),
@@ -155,33 +167,66 @@ impl Replayed<'_> {
     }
 
     fn begin(&self) -> Result<Session, WorkError> {
-        let mut args = parse(self.recording, self.folder, &self.run.options).map_err(bad_input)?;
+        let mut args = parse(self.recording, self.folder, &self.options).map_err(bad_input)?;
         args = args.calibrated(self.verbosity).map_err(bad_input)?;
         args.keep_checkpoints(CHECKPOINT_EVERY).map_err(bad_input)?;
         let (recording, gpu) = args.open().map_err(failed)?;
         Session::with_device(recording, gpu, self.folder).map_err(of_session)
     }
 
-    /// Runs to the end and measures; `false` if a signal ended the run early.
-    fn finish(&self, mut session: Session) -> Result<bool, SessionError> {
+    /// Runs to the end; `false` if a signal ended the run early.
+    fn finish(&self, mut session: Session, finish: Finish<'_>) -> Result<bool, SessionError> {
         let Signals(progress) = self.signals;
         let replay = session.run(progress)?;
         if replay.stopped {
             return Ok(false);
         }
-        session.finish(replay, &|_views| ())?;
+        finish(&session, replay)?;
         Ok(true)
     }
+}
 
-    fn made(&self) -> Result<Made, WorkError> {
-        let text = std::fs::read_to_string(self.folder.join(outputs::METRICS)).map_err(failed)?;
-        let metrics = serde_json::from_str(&text).map_err(failed)?;
-        let row = SweepRow::new(&self.run.sequence, &self.run.variant, self.seed, &metrics);
-        let figures = serde_json::to_value(SweepRow { wall_s: 0.0, peak_host_bytes: None, ..row }).map_err(failed)?;
-        let map = outputs::find_map(self.folder).and_then(|(map, _)| Some(map.file_name()?.to_string_lossy().into_owned()));
-        let files = map.into_iter().chain([outputs::TRAJECTORY, outputs::KEYFRAMES].map(String::from)).collect();
-        Ok(Made { figures, files, timed_files: vec![outputs::METRICS.into()] })
-    }
+/// The result of a run that was measured.
+fn measured(run: &RunTask, seed: u64, folder: &Path) -> Result<Made, WorkError> {
+    let text = std::fs::read_to_string(folder.join(outputs::METRICS)).map_err(failed)?;
+    let metrics = serde_json::from_str(&text).map_err(failed)?;
+    let row = SweepRow::new(&run.sequence, &run.variant, seed, &metrics);
+    let figures = serde_json::to_value(SweepRow { wall_s: 0.0, peak_host_bytes: None, ..row }).map_err(failed)?;
+    let files = map_name(folder).into_iter().chain([outputs::TRAJECTORY, outputs::KEYFRAMES].map(String::from)).collect();
+    Ok(Made { figures, files, timed_files: vec![outputs::METRICS.into()] })
+}
+
+fn map_name(folder: &Path) -> Option<String> {
+    outputs::find_map(folder).and_then(|(map, _)| Some(map.file_name()?.to_string_lossy().into_owned()))
+}
+
+/// Options of the run that refines a cell.
+fn options_of_cell(plan: &Plan, cell: &CellTask) -> Result<Vec<String>, toml::ser::Error> {
+    let mut region = String::new();
+    serde::Serialize::serialize(&cell.region, toml::ser::ValueSerializer::new(&mut region))?;
+    let run = plan.folder().join(&cell.run).to_string_lossy().into_owned();
+    let own = ["--refine".into(), run, "--set".into(), format!("refined.region={region}")];
+    Ok(own.into_iter().chain(cell.options.iter().cloned()).collect())
+}
+
+fn write_cell(session: &Session, replay: Replay, folder: &Path) -> Result<(), SessionError> {
+    let result = session.write(replay)?;
+    let row = CellRow {
+        keyframes: result.keyframes.len(),
+        steps: result.step_ms.len(),
+        gaussians: result.cloud.len(),
+        wall_s: result.wall_s,
+    };
+    let text = serde_json::to_string(&row).expect("a row is numbers");
+    Ok(keysplat::files::write_atomically(&folder.join(CellRow::FILE), text.as_bytes()).map_err(OutputError::from)?)
+}
+
+/// The result of a cell that was refined.
+fn refined(folder: &Path) -> Result<Made, WorkError> {
+    let text = std::fs::read_to_string(folder.join(CellRow::FILE)).map_err(failed)?;
+    let row: CellRow = serde_json::from_str(&text).map_err(failed)?;
+    let figures = serde_json::to_value(CellRow { wall_s: 0.0, ..row }).map_err(failed)?;
+    Ok(Made { figures, files: map_name(folder).into_iter().collect(), timed_files: vec![CellRow::FILE.into()] })
 }
 
 fn of_session(error: SessionError) -> WorkError {

@@ -4,6 +4,7 @@ use super::{Mapper, Step};
 use crate::mapping::density::{self, MapSize};
 use crate::mapping::{DensityConfig, DensityStrategy, MappingError};
 use crate::optimise::ErrorPixels;
+use crate::render::layout::VERDICT_KEEP;
 
 impl Mapper {
     /// Whether, and by what, Gaussians are scored: for control of their density, or to know which to give up.
@@ -26,6 +27,9 @@ impl Mapper {
             self.density.prepare(&self.gpu, &density.setup(&self.map_size()))?;
             verdicts = self.trainer.over_scores(&self.density.verdicts(&self.gpu, &self.cloud))?;
         }
+        // What is frozen neither goes nor is divided.
+        let frozen = self.cloud.frozen();
+        verdicts[..frozen].fill(VERDICT_KEEP);
         self.density.remember(&self.gpu, &self.cloud, self.trainer.scores());
         let before = self.cloud.len();
         let mut plan = density::plan(&verdicts, self.most_gaussians(), density);

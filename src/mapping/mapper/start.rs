@@ -3,6 +3,7 @@
 use glam::Vec3;
 
 use super::{KeyframeId, Mapper, MappingError, initialise_from_points};
+use crate::mapping::InitialMap;
 use crate::sequence::KnownPoint;
 use crate::splat::{Gaussian, GaussianCloud, unit_rotation};
 
@@ -27,12 +28,21 @@ impl Mapper {
     /// this mapper's degree.
     ///
     /// # Errors
-    /// [`MappingError`] if a buffer does not fit or the device fails.
-    pub fn add_map(&mut self, map: &GaussianCloud, anchor: KeyframeId) -> Result<(), MappingError> {
-        let mut new = GaussianCloud::new(self.config.sh_degree);
-        (0..map.len()).filter_map(|i| tamed(map.get(i))).for_each(|gaussian| new.push(gaussian));
+    /// [`MappingError`] if a buffer does not fit, a part of the map is frozen and not all of it fits, or the device fails.
+    pub fn add_map(&mut self, map: &InitialMap, anchor: KeyframeId) -> Result<(), MappingError> {
+        let mut parts = [GaussianCloud::new(self.config.sh_degree), GaussianCloud::new(self.config.sh_degree)];
+        for i in 0..map.cloud.len() {
+            let part = &mut parts[usize::from(i >= map.frozen)];
+            tamed(map.cloud.get(i)).into_iter().for_each(|gaussian| part.push(gaussian));
+        }
         self.has_initial_map = true;
-        self.begin_with(new, anchor)
+        let [frozen, moving] = parts;
+        if self.probe(self.cloud.len() + frozen.len() + moving.len()) && !frozen.is_empty() {
+            return Err(MappingError::NoRoom { gaussians: frozen.len() + moving.len() });
+        }
+        self.begin_with(frozen, anchor)?;
+        self.cloud.freeze(self.cloud.len());
+        self.begin_with(moving, anchor)
     }
 
     fn begin_with(&mut self, mut new: GaussianCloud, anchor: KeyframeId) -> Result<(), MappingError> {

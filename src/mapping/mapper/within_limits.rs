@@ -63,9 +63,12 @@ impl Mapper {
         if excess == 0 {
             return Ok(());
         }
-        let histories: Vec<GaussianHistory> = self.cloud.histories().read(&self.gpu, 0, self.cloud.len())?;
+        let frozen = self.cloud.frozen();
+        let histories: Vec<GaussianHistory> = self.cloud.histories().read(&self.gpu, frozen, self.cloud.len() - frozen)?;
         let scored_round = self.cloud.rounds() as f32 - self.config.density.every as f32;
-        self.change(&Plan::removing(limits::least_contributions(&histories, excess, scored_round)))
+        let mut least = limits::least_contributions(&histories, excess.min(histories.len()), scored_round);
+        least.iter_mut().for_each(|gaussian| *gaussian += frozen as u32);
+        self.change(&Plan::removing(least))
     }
 
     /// Changes the set of Gaussians.

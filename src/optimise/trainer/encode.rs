@@ -93,7 +93,7 @@ impl Trainer {
         let is_planar = self.rasterizer.blending().is_planar();
         let thickness = is_planar.then_some(self.planar.thickness);
         let adam = match sink {
-            Sink::Adam(adam) => Some(self.rasterizer.uniforms.put(&adam.setup(self.steps, thickness))),
+            Sink::Adam(adam) => Some(self.rasterizer.uniforms.put(&adam.setup(self.steps, thickness, cloud.frozen()))),
             Sink::Gradient(_) => None,
         };
         let (gpu, ws, k) = (self.rasterizer.gpu(), &self.rasterizer.workspace, &self.kernels);

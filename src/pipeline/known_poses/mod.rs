@@ -2,13 +2,17 @@
 //!
 //! Photos become keyframes all, frames of a moving camera by the tracker's keyframe thresholds; held-out ones never.
 //! Frames without a pose count as lost. Where the recording has no depth, points begin the map: its own, or triangulated ones, which the
-//! plane sweep then uses as landmarks. A map of others begins it where one is given. The world's unit is that of the poses.
+//! plane sweep then uses as landmarks. A map of others begins it where one is given. The world's unit is that of the poses. A finished run that
+//! is refined has keyframes of its own.
 
+mod refined;
 mod scene;
 
 use std::time::Instant;
 
 pub(super) use scene::Scene;
+
+use refined::Refined;
 
 use super::progress::{KeyframePoses, TrackingProgress, guarded};
 use super::read_thread::QueuedFrame;
@@ -46,7 +50,16 @@ impl Follower<'_> {
         moved.max(a_from_camera.rotation.angle() / self.recording.config().tracking.keyframe_rotation_rad)
     }
 
+    fn pose(&self, frame: &Frame) -> Option<Se3> {
+        let known = || self.recording.known_pose(frame.timestamp_s);
+        let of_run = |refined: &Refined| Some(refined.keyframes.get(&frame.index)?.world_from_camera);
+        self.scene.refined().map_or_else(known, of_run)
+    }
+
     fn is_due(&self, index: usize, world_from_camera: &Se3) -> bool {
+        if let Some(refined) = self.scene.refined() {
+            return refined.keyframes.contains_key(&index);
+        }
         let photos = self.recording.sequence().layout.is_photos();
         let far = |last: &Known| self.apart(last, world_from_camera) >= 1.0;
         !self.recording.config().replay.is_held_out(index) && (photos || self.keyframes.last().is_none_or(far))
@@ -77,7 +90,11 @@ impl Follower<'_> {
         let pose = KeyframePose { id, frame_index: frame.index, timestamp_s: frame.timestamp_s, world_from_camera };
         let distance = image.median_depth_metres().unwrap_or_else(|| self.scene.distance());
         self.keyframes.push(Known { pose, distance });
-        Keyframe { id, world_from_camera, image, depth_source, covisible }
+        let refined = self.scene.refined().and_then(|refined| refined.keyframes.get(&frame.index));
+        if let Some(valid) = refined.and_then(|keyframe| keyframe.valid.as_ref()) {
+            image.restrict(valid);
+        }
+        Keyframe { id, world_from_camera, image, depth_source, covisible, exposure: refined.map(|keyframe| keyframe.exposure) }
     }
 }
 
@@ -95,13 +112,18 @@ pub(super) fn follow(thread: &TrackThread<'_>, scene: &Scene<'_>) -> TrackSummar
     if first.is_some_and(|message| mapper.send(message).is_err()) {
         return summary;
     }
+    if let Some(refined) = scene.refined() {
+        summary.trajectory.clone_from(&refined.trajectory);
+    }
     let mut world_from_camera = None;
     for QueuedFrame { frame, .. } in frames {
         let started = Instant::now();
-        let known = recording.known_pose(frame.timestamp_s);
+        let known = follower.pose(&frame);
         let mut keyframe = None;
         if let Some(world_from_camera) = known {
-            summary.trajectory.push((frame.index, StampedPose { timestamp_s: frame.timestamp_s, world_from_camera }));
+            if scene.refined().is_none() {
+                summary.trajectory.push((frame.index, StampedPose { timestamp_s: frame.timestamp_s, world_from_camera }));
+            }
             if follower.is_due(frame.index, &world_from_camera) {
                 keyframe = Some(guarded("tracking", || Ok(follower.make_keyframe(&frame, world_from_camera))));
             }

@@ -11,9 +11,10 @@ use glam::Vec3;
 use nalgebra::{Point3, Vector2, Vector3};
 use rayon::prelude::*;
 
+use super::refined::{Refined, core_of};
 use crate::export::ExportFilter;
 use crate::geometry::Se3;
-use crate::mapping::MappingConfig;
+use crate::mapping::{InitialMap, MappingConfig};
 use crate::pipeline::{PipelineError, Progress};
 use crate::recording::Recording;
 use crate::run_folder::outputs;
@@ -46,7 +47,9 @@ pub(in crate::pipeline) struct Scene<'a> {
     /// By frame; none where the points came with the recording.
     seen: BTreeMap<usize, Vec<SeenPoint>>,
     /// What the map begins with instead of the points.
-    initial_map: Option<Arc<GaussianCloud>>,
+    initial_map: Option<InitialMap>,
+    /// The run that is refined; its map is the initial one.
+    refined: Option<Refined>,
     /// Median depth of the points in the cameras that have them in view, in the world's unit.
     distance: Option<f64>,
 }
@@ -63,12 +66,19 @@ impl<'a> Scene<'a> {
             recording,
             points: Cow::Borrowed(&sequence.points),
             seen: BTreeMap::new(),
-            initial_map: recording.config().initial_map.as_deref().map(|path| initial_map(path, recording)).transpose()?,
+            initial_map: None,
+            refined: None,
             distance: None,
         };
+        if let Some(refined) = &recording.config().refined {
+            let refined = Refined::read(refined, initial_map(&refined.run, recording)?, recording)?;
+            (scene.initial_map, scene.refined) = (Some(refined.map.clone()), Some(refined));
+        } else if let Some(path) = &recording.config().initial_map {
+            scene.initial_map = Some(InitialMap { cloud: initial_map(path, recording)?, frozen: 0 });
+        }
         if let Some(map) = scene.initial_map.as_ref().filter(|_| sequence.points.is_empty()) {
             let point = |mean: &Vec3| KnownPoint { position: Vector3::from(mean.to_array().map(f64::from)), color: [0; 3] };
-            scene.points = map.means.iter().map(point).collect();
+            scene.points = map.cloud.means.iter().map(point).collect();
         } else if sequence.sensor != Sensor::Rgbd && sequence.points.is_empty() {
             scene.seen = triangulate(recording, progress)?;
             let points = scene.seen.values().flatten();
@@ -83,8 +93,26 @@ impl<'a> Scene<'a> {
     }
 
     /// What the map begins with instead of points.
-    pub fn initial_map(&self) -> Option<Arc<GaussianCloud>> {
+    pub fn initial_map(&self) -> Option<InitialMap> {
         self.initial_map.clone()
+    }
+
+    /// The run that is refined.
+    pub(super) fn refined(&self) -> Option<&Refined> {
+        self.refined.as_ref()
+    }
+
+    /// What of the final map is the run's result: all of it, or a region's core.
+    pub fn result_of(&self, map: Arc<GaussianCloud>) -> Arc<GaussianCloud> {
+        let region = self.recording.config().refined.as_ref().and_then(|refined| refined.region);
+        let Some((region, refined)) = region.zip(self.refined.as_ref()) else { return map };
+        Arc::new(core_of(&map, refined.map.frozen, &region))
+    }
+
+    /// The frames that have something for the mapper, ascending.
+    pub fn frames(&self) -> Vec<usize> {
+        let all = || (0..self.recording.sequence().entries.len()).collect();
+        self.refined.as_ref().map_or_else(all, |refined| refined.keyframes.keys().copied().collect())
     }
 
     /// Median depth of what frames see, in the world's unit.

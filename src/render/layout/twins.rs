@@ -275,7 +275,9 @@ host_twins! {
         color_settling: f32,
         /// Least share of the newest parameters in their average.
         least_share: f32,
+        /// Gaussians before this place never move.
+        frozen: u32,
         /// Unused.
-        pad: [f32; 2],
+        pad: f32,
     }
 }

@@ -1,0 +1,131 @@
+//! A finished run that is refined: its poses, its exposures and its map, or the part of them that a region needs.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use rayon::prelude::*;
+
+use crate::config::RefinedConfig;
+use crate::evaluation::Exposures;
+use crate::evaluation::trajectory::MAX_TIME_DIFFERENCE_S;
+use crate::geometry::{Se3, StampedPose, Trajectory};
+use crate::mapping::InitialMap;
+use crate::partition::{Coverage, PartView, Place, Region};
+use crate::pipeline::PipelineError;
+use crate::recording::Recording;
+use crate::run_folder::outputs;
+use crate::sequence::Sequence;
+use crate::splat::{Exposure, GaussianCloud, ViewCamera};
+
+/// A keyframe of the run.
+#[derive(Clone, Debug)]
+pub(super) struct RefinedKeyframe {
+    pub world_from_camera: Se3,
+    pub exposure: Exposure,
+    /// `[height * width]` of the mapping resolution: pixels that show the region or its halo; `None`: all.
+    pub valid: Option<Arc<[bool]>>,
+}
+
+/// What of a run is refined.
+#[derive(Clone, Debug)]
+pub(super) struct Refined {
+    /// Frame and pose of all that was tracked.
+    pub trajectory: Vec<(usize, StampedPose)>,
+    /// By frame.
+    pub keyframes: BTreeMap<usize, RefinedKeyframe>,
+    pub map: InitialMap,
+}
+
+impl Refined {
+    /// Reads a run. With a region: its keyframes are those that see it, and its map has first, frozen, what these see beyond the halo.
+    ///
+    /// # Errors
+    /// [`PipelineError::RefinedRun`] if a file of it is missing, does not parse or belongs to another recording; [`PipelineError::NotSeen`] if no
+    /// keyframe sees the region.
+    pub fn read(config: &RefinedConfig, map: Arc<GaussianCloud>, recording: &Recording) -> Result<Self, PipelineError> {
+        let sequence = recording.sequence();
+        let wrong = |path: PathBuf, reason: String| PipelineError::RefinedRun { path, reason };
+        let poses = |name: &str| {
+            let path = config.run.join(name);
+            let trajectory = Trajectory::read_tum(&path).map_err(|error| wrong(path.clone(), error.to_string()))?;
+            let found = frames(sequence, &trajectory);
+            if found.is_empty() {
+                return Err(wrong(path, format!("has no pose near a frame of {}", sequence.name)));
+            }
+            Ok(found)
+        };
+        let exposures = exposures(&config.run.join(outputs::EXPOSURES)).map_err(|(path, reason)| wrong(path, reason))?;
+        let keyframe = |(frame, pose): (usize, StampedPose)| {
+            let exposure = exposures.at(pose.timestamp_s);
+            (frame, RefinedKeyframe { world_from_camera: pose.world_from_camera, exposure, valid: None })
+        };
+        let keyframes = poses(outputs::KEYFRAMES)?.into_iter().map(keyframe).collect();
+        let whole = Self { trajectory: poses(outputs::TRAJECTORY)?, keyframes, map: InitialMap { cloud: map, frozen: 0 } };
+        match config.region {
+            Some(region) => whole.within(&region, recording),
+            None => Ok(whole),
+        }
+    }
+
+    /// The part of it that a region needs.
+    fn within(self, region: &Region, recording: &Recording) -> Result<Self, PipelineError> {
+        let cloud = &*self.map.cloud;
+        let places: Vec<Place> = cloud.means.iter().map(|mean| region.place(*mean)).collect();
+        let keyframes: Vec<(usize, RefinedKeyframe)> = self.keyframes.into_iter().collect();
+        let seen = |(frame, keyframe): &(usize, RefinedKeyframe)| {
+            let camera = camera_of(recording, *frame, &keyframe.world_from_camera);
+            let coverage = Coverage::of(cloud, &camera);
+            let PartView { valid, context } = PartView::of(&coverage, &places)?;
+            let (width, height) = (camera.pinhole.width, camera.pinhole.height);
+            Some((coverage.to_pixels(&valid, width, height), context))
+        };
+        let seen: Vec<Option<(Vec<bool>, Vec<u32>)>> = keyframes.par_iter().map(seen).collect();
+        let mut is_context = vec![false; cloud.len()];
+        let mut chosen = BTreeMap::new();
+        for ((frame, keyframe), seen) in keyframes.into_iter().zip(seen) {
+            let Some((valid, context)) = seen else { continue };
+            context.into_iter().for_each(|gaussian| is_context[gaussian as usize] = true);
+            chosen.insert(frame, RefinedKeyframe { valid: Some(valid.into()), ..keyframe });
+        }
+        if chosen.is_empty() {
+            return Err(PipelineError::NotSeen);
+        }
+        let mut part = cloud.emptied();
+        let context = (0..cloud.len()).filter(|&i| places[i] == Place::Beyond && is_context[i]);
+        context.for_each(|i| part.push(cloud.get(i)));
+        let frozen = part.len();
+        (0..cloud.len()).filter(|&i| places[i] != Place::Beyond).for_each(|i| part.push(cloud.get(i)));
+        tracing::info!(keyframes = chosen.len(), gaussians = part.len() - frozen, context = frozen, "region");
+        Ok(Self { keyframes: chosen, map: InitialMap { cloud: Arc::new(part), frozen }, ..self })
+    }
+}
+
+/// A frame's camera at the mapping resolution.
+fn camera_of(recording: &Recording, frame: usize, world_from_camera: &Se3) -> ViewCamera {
+    let pinhole = recording.sequence().camera_of(frame).pinhole.scaled(recording.config().map_scale);
+    ViewCamera { pinhole, camera_from_world: world_from_camera.inverse() }
+}
+
+/// The core of a region in a map of which the first `frozen` Gaussians belong to its context.
+pub(super) fn core_of(map: &GaussianCloud, frozen: usize, region: &Region) -> GaussianCloud {
+    let mut core = map.emptied();
+    (frozen..map.len()).filter(|&i| region.place(map.means[i]) == Place::Core).for_each(|i| core.push(map.get(i)));
+    core
+}
+
+/// The frame nearest in time to each pose, once.
+fn frames(sequence: &Sequence, trajectory: &Trajectory) -> Vec<(usize, StampedPose)> {
+    let nearest = |pose: &StampedPose| Some((sequence.nearest(pose.timestamp_s, MAX_TIME_DIFFERENCE_S)?, *pose));
+    let found: BTreeMap<usize, StampedPose> = trajectory.poses.iter().filter_map(nearest).collect();
+    found.into_iter().collect()
+}
+
+/// The run's exposures; none where it did not estimate them.
+fn exposures(path: &Path) -> Result<Exposures, (PathBuf, String)> {
+    match std::fs::read_to_string(path) {
+        Ok(text) => Exposures::parse(&text).ok_or_else(|| (path.into(), "does not hold exposures".into())),
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(Exposures::default()),
+        Err(error) => Err((path.into(), error.to_string())),
+    }
+}
