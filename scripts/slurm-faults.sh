@@ -1,9 +1,11 @@
 #!/bin/bash
 # Runs a plan on a real Slurm of three one-core nodes on this machine, causes one fault at a time, and compares what it ends in with an
 # unbroken run: the same digest of the results, or the hole named. Root; slurm-wlm and munge.
-# usage: scripts/slurm-faults.sh [TASKS [FAULT]...]
+# usage: [PLAN=cells] scripts/slurm-faults.sh [TASKS [FAULT]...]
+# The plan is a sweep of so many runs, or with PLAN=cells the refinement of one run's map in so many cells.
 set -euo pipefail
 
+kind=${PLAN:-sweep}
 tasks=${1:-12}
 shift "$(($# < 1 ? $# : 1))"
 faults=(none "$@")
@@ -94,7 +96,14 @@ new_plan() {
     local epochs=$1 count=$2
     rm -rf "$plan" "$work/room"
     cp -r "$work/original" "$work/room"
-    "$keysplat" -q bench sweep "$work/room" --plan "$plan" --epochs "$epochs" --seeds "$(seq -s, 0 $((count - 1)))" >/dev/null
+    if [ "$kind" = cells ]; then
+        # Divided at the medians.
+        local most=$(($(sed -n 's/.*"gaussians": \([0-9]*\).*/\1/p' "$work/run/metrics.json" | head -1) / count + 2))
+        "$keysplat" -q split "$work/run" --size 1000 --halo 0.5 --max-gaussians $most --out "$plan" -- \
+            --set "mapping.refine.final_epochs=$epochs" >/dev/null
+    else
+        "$keysplat" -q bench sweep "$work/room" --plan "$plan" --epochs "$epochs" --seeds "$(seq -s, 0 $((count - 1)))" >/dev/null
+    fi
 }
 submit() { "$keysplat" -q jobs submit "$plan" --slurm -- "$@" >/dev/null; }
 # A process of the first task that has begun and not ended.
@@ -165,6 +174,10 @@ cy = 59.5
 kind = "sweep"
 SCENE
 "$keysplat" -q generate "$work/room.toml" -o "$work/original"
+if [ "$kind" = cells ]; then
+    cp -r "$work/original" "$work/room"
+    "$keysplat" -q run "$work/room" --out "$work/run" --map-scale 1 --set mapping.refine.final_epochs=4 >/dev/null
+fi
 printf '%-16s %7s %5s %6s  %-16s %-17s %s\n' fault seconds done failed digest '' holes
 whole='' long='' failed=0
 for fault in "${faults[@]}"; do

@@ -220,8 +220,8 @@ impl Config {
         Self { replay, mapping: MappingConfig::offline(), ..Self::default() }
     }
 
-    /// Settings to refine a finished run with: its own, but each keyframe only arrives, and poses and exposures stay as they are. A resolution is
-    /// the run's own.
+    /// Settings to refine a finished run with: its own, but each keyframe only arrives, and poses and exposures stay as they are. No Gaussian is
+    /// pruned for what it contributes: its best views are not among the few that score a round, and their record ended with the run.
     ///
     /// # Errors
     /// [`ConfigError`] if the run's `config.toml` cannot be read.
@@ -231,7 +231,10 @@ impl Config {
         let replay = ReplayConfig { real_time: false, known_poses: true, ..config.replay };
         let refine = RefineConfig { steps_per_keyframe: 0, seconds: None, ..config.mapping.refine };
         let exposure = ExposureConfig { refinements: 0, ..config.mapping.exposure };
+        let mut density = config.mapping.density;
+        (density.multi_view.min_weight, density.multi_view.min_contribution) = (0.0, 0.0);
         let mapping = MappingConfig {
+            density,
             iterations_per_keyframe: 0,
             first_iterations: 0,
             yields_to_keyframes: false,

@@ -58,7 +58,7 @@ pub struct RunArgs {
     #[arg(long, value_name = "MAP")]
     initial_map: Option<PathBuf>,
     /// Refine a finished run further, with its poses, exposures, map and settings. Its recording is that of the run unless it is named.
-    #[arg(long, value_name = "RUN", conflicts_with_all = ["config", "known_poses", "initial_map", "preset", "real_time", "map_scale"])]
+    #[arg(long, value_name = "RUN", conflicts_with_all = ["config", "known_poses", "initial_map", "preset", "real_time"])]
     refine: Option<PathBuf>,
     /// Part of the name of the adapter to use (see `keysplat adapters`).
     #[arg(long)]

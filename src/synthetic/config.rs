@@ -201,8 +201,8 @@ impl SceneConfig {
     pub fn validate(&self) -> Result<(), SceneError> {
         self.validate_camera()?;
         let room = &self.room;
-        within("room.width", room.width, 3.5, 12.0)?;
-        within("room.depth", room.depth, 3.5, 12.0)?;
+        within("room.width", room.width, 3.5, 60.0)?;
+        within("room.depth", room.depth, 3.5, 60.0)?;
         within("room.height", room.height, 2.2, 5.0)?;
         within("room.gloss", room.gloss, 0.0, 1.0)?;
         let path = &self.path;
@@ -215,7 +215,7 @@ impl SceneConfig {
         self.validate_degradation()?;
         let f = &self.furniture;
         let counts = [f.tables, f.shelves, f.sofas, f.cabinets, f.lamps, f.plants, f.boxes, f.rugs, f.pictures, f.windows];
-        within("furniture (pieces in all)", counts.iter().fold(0usize, |sum, n| sum.saturating_add(*n)) as f64, 0.0, 100.0)
+        within("furniture (pieces in all)", counts.iter().fold(0usize, |sum, n| sum.saturating_add(*n)) as f64, 0.0, 400.0)
     }
 
     fn validate_camera(&self) -> Result<(), SceneError> {

@@ -45,6 +45,8 @@ struct Precision {
     harmonic_step: f32,
     /// Positions are rounded to this share of the median of the Gaussians' least extents, or finer.
     position_step: f64,
+    /// Steps of the bytes of rotations: two are 0.6 degrees.
+    rotation_step: u8,
     /// Gaussians that share an entry of the palette, on average: an entry costs about as many bytes as five labels.
     gaussians_per_entry: f64,
     /// Weight of harmonics themselves beside the colours in a view, once entries are chosen: they are smaller then where nobody looks.
@@ -57,6 +59,7 @@ const FINE: Precision = Precision {
     constant_step: 0.0125,
     harmonic_step: 1.0 / 64.0,
     position_step: 1.0 / 32.0,
+    rotation_step: 1,
     gaussians_per_entry: 2.5,
     ridge: 1e-5,
 };
@@ -67,7 +70,8 @@ const COMPACT: Precision = Precision {
     constant_step: 0.025,
     harmonic_step: 1.0 / 16.0,
     position_step: 1.0 / 12.0,
-    gaussians_per_entry: 7.0,
+    rotation_step: 2,
+    gaussians_per_entry: 6.0,
     ridge: 1e-5,
 };
 

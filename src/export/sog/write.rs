@@ -37,7 +37,7 @@ fn bundle(mut cloud: GaussianCloud, cameras: &[Se3], precision: &Precision) -> R
     let harmonics = if has_harmonics { Some(write_harmonics(&mut zip, &mut cloud, cameras, precision)?) } else { None };
     let count = cloud.len();
     let means = write_means(&mut zip, &cloud, precision.position_step)?;
-    zip.add_plane("quats.webp", &Plane::of(count, |i| smallest_three(cloud.rotations[i])))?;
+    zip.add_plane("quats.webp", &Plane::of(count, |i| smallest_three(cloud.rotations[i], precision.rotation_step)))?;
     let scales = Codebook::new(cloud.log_scales.iter().flat_map(|scale| scale.to_array()), precision.scale_step);
     let coded = |codebook: &Codebook, values: Vec3, last: u8| {
         let [r, g, b] = values.to_array().map(|value| codebook.place(value));
@@ -97,15 +97,17 @@ fn write_means(zip: &mut Writer, cloud: &GaussianCloud, position_step: f64) -> R
     Ok(Means { mins, maxs, files: ["means_l.webp".into(), "means_u.webp".into()] })
 }
 
-/// Three bytes for the components but the largest, in the order of w, x, y and z, and one that says which that is.
-fn smallest_three(rotation: Quat) -> [u8; 4] {
+/// Three bytes for the components but the largest, in the order of w, x, y and z, and one that says which that is. The bytes are whole steps.
+fn smallest_three(rotation: Quat, step: u8) -> [u8; 4] {
     let [x, y, z, w] = unit_rotation(rotation).to_array();
     let q = [w, x, y, z];
     let largest = (0..4).fold(0, |largest, k| if q[k].abs() > q[largest].abs() { k } else { largest });
     let scale = if q[largest] < 0.0 { -std::f32::consts::SQRT_2 } else { std::f32::consts::SQRT_2 };
     let mut bytes = [LARGEST + largest as u8; 4];
     let others = (0..4).filter(|k| *k != largest);
-    others.zip(&mut bytes).for_each(|(k, byte)| *byte = ((q[k] * scale * 0.5 + 0.5) * 255.0).round() as u8);
+    let step = f32::from(step);
+    let coded = |component: f32| (((component * scale * 0.5 + 0.5) * 255.0 / step).round() * step).min(255.0) as u8;
+    others.zip(&mut bytes).for_each(|(k, byte)| *byte = coded(q[k]));
     bytes
 }
 
