@@ -9,6 +9,9 @@ use miette::{IntoDiagnostic, miette};
 
 use super::jobs;
 
+/// An end beyond is none, metres.
+const FAR: f32 = 1e5;
+
 #[derive(Args)]
 pub struct SplitArgs {
     /// Folder of a finished run.
@@ -16,7 +19,7 @@ pub struct SplitArgs {
     /// Folder of the plan, for `keysplat jobs`.
     #[arg(short, long)]
     out: PathBuf,
-    /// Largest side of a cell, metres.
+    /// Largest extent of the cameras in a cell, metres.
     #[arg(long, default_value_t = 10.0)]
     size: f32,
     /// Width of the surroundings that are refined with a cell and left out of the result, metres.
@@ -43,7 +46,8 @@ pub fn split(args: &SplitArgs) -> miette::Result<()> {
     }
     let (run, recording) = (draft.place(&args.run).into_diagnostic()?, draft.place(&found.recording).into_diagnostic()?);
     for Cell { region, gaussians, keyframes } in found.cells {
-        let [x, y, z] = [0, 1, 2].map(|axis| format!("{:.1}..{:.1}", region.low[axis], region.high[axis]));
+        let end = |value: f32| if value.abs() < FAR { format!("{value:.1}") } else { String::new() };
+        let [x, y, z] = [0, 1, 2].map(|axis| format!("{}..{}", end(region.low[axis]), end(region.high[axis])));
         tracing::info!(gaussians, keyframes, "cell x {x}, y {y}, z {z}");
         let task = CellTask { run: run.clone(), recording: recording.clone(), region, options: args.options.clone() };
         let name = format!("x {x}, y {y}, z {z}");

@@ -49,13 +49,6 @@ impl Region {
         }
     }
 
-    /// Distance of a point from the region's border, from inside or outside; metres.
-    pub fn distance_from_border(&self, point: Vec3) -> f32 {
-        let (low, high) = (Vec3::from(self.low), Vec3::from(self.high));
-        let outside = (low - point).max(point - high).max(Vec3::ZERO).length();
-        if outside > 0.0 { outside } else { (point - low).min(high - point).min_element() }
-    }
-
     /// Checks every value.
     ///
     /// # Errors
@@ -74,13 +67,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn each_place_and_distance_is_found() {
+    fn each_place_is_found() {
         let region = Region { low: [0.0, -1.0, 0.0], high: [2.0, 1.0, 4.0], halo: 0.5 };
         assert_eq!(region.place(Vec3::new(0.0, -1.0, 0.0)), Place::Core);
         assert_eq!(region.place(Vec3::new(2.0, 0.0, 1.0)), Place::Halo);
         assert_eq!(region.place(Vec3::new(1.0, 0.0, 4.6)), Place::Beyond);
-        assert_eq!(region.distance_from_border(Vec3::new(0.25, 0.0, 2.0)), 0.25);
-        assert_eq!(region.distance_from_border(Vec3::new(5.0, 0.0, 8.0)), 5.0);
         assert!(region.validate().is_ok());
         for wrong in [
             Region { high: [2.0, -1.0, 4.0], ..region },

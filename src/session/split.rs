@@ -2,6 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
+use glam::Vec3;
+
 use super::SessionError;
 use super::evaluate::{nearest_frames, read_trajectory};
 use crate::config::Config;
@@ -13,7 +15,7 @@ use crate::splat::ViewCamera;
 /// How a run is divided.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SplitOptions {
-    /// Largest side of a cell, metres.
+    /// Largest extent of the cameras in a cell, metres.
     pub size: f32,
     /// Width of a cell's surroundings that are refined with it, metres.
     pub halo: f32,
@@ -63,7 +65,10 @@ pub fn split_run(run: &Path, options: &SplitOptions) -> Result<Split, SessionErr
         ViewCamera { pinhole, camera_from_world: world_from_camera.inverse() }
     };
     let cameras: Vec<ViewCamera> = keyframes.iter().map(camera).collect();
-    let regions = cells(&map.means, options.size, options.max_gaussians, options.halo);
+    let position =
+        |camera: &ViewCamera| Vec3::from(camera.camera_from_world.inverse().translation.vector.map(|v| v as f32).data.0[0]);
+    let positions: Vec<Vec3> = cameras.iter().map(position).collect();
+    let regions = cells(&map.means, &positions, (options.size, options.max_gaussians), options.halo);
     let seen = cameras_that_see(&map, &regions, &cameras);
     let cell = |(region, keyframes): (Region, usize)| {
         let gaussians = map.means.iter().filter(|mean| region.place(**mean) == Place::Core).count();

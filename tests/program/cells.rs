@@ -21,7 +21,7 @@ fn finished_run() -> &'static Path {
 }
 
 fn split(plan: &Path) -> Finished {
-    let mut command = keysplat(["split", finished_run().to_str().unwrap(), "--size", "2.5", "--halo", "0.5", "--out"]);
+    let mut command = keysplat(["split", finished_run().to_str().unwrap(), "--max-gaussians", "3000", "--halo", "0.5", "--out"]);
     command.arg(plan).args(["--", "--set", "mapping.refine.final_epochs=6", "--set", "mapping.refine.density_every=50"]);
     command.args(["--checkpoint-every", "1"]);
     finish(command)

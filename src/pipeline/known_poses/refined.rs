@@ -18,6 +18,11 @@ use crate::run_folder::outputs;
 use crate::sequence::Sequence;
 use crate::splat::{Exposure, GaussianCloud, ViewCamera};
 
+/// A Gaussian is refined with a region whose keyframes see this share of what all see of it.
+const LEAST_SUPERVISION: f32 = 0.8;
+/// Keyframes looked at side by side.
+const AT_ONCE: usize = 64;
+
 /// A keyframe of the run.
 #[derive(Clone, Debug)]
 pub(super) struct RefinedKeyframe {
@@ -73,30 +78,38 @@ impl Refined {
         let cloud = &*self.map.cloud;
         let places: Vec<Place> = cloud.means.iter().map(|mean| region.place(*mean)).collect();
         let keyframes: Vec<(usize, RefinedKeyframe)> = self.keyframes.into_iter().collect();
-        let seen = |(frame, keyframe): &(usize, RefinedKeyframe)| {
+        let look = |(frame, keyframe): &(usize, RefinedKeyframe)| {
             let camera = camera_of(recording, *frame, &keyframe.world_from_camera);
             let coverage = Coverage::of(cloud, &camera);
-            let PartView { valid, context } = PartView::of(&coverage, &places)?;
-            let (width, height) = (camera.pinhole.width, camera.pinhole.height);
-            Some((coverage.to_pixels(&valid, width, height), context))
+            let part = PartView::of(&coverage, &places);
+            (camera.pinhole, coverage, part)
         };
-        let seen: Vec<Option<(Vec<bool>, Vec<u32>)>> = keyframes.par_iter().map(seen).collect();
-        let mut is_context = vec![false; cloud.len()];
+        let (mut is_context, mut supervision) = (vec![false; cloud.len()], vec![Supervision::default(); cloud.len()]);
         let mut chosen = BTreeMap::new();
-        for ((frame, keyframe), seen) in keyframes.into_iter().zip(seen) {
-            let Some((valid, context)) = seen else { continue };
-            context.into_iter().for_each(|gaussian| is_context[gaussian as usize] = true);
-            chosen.insert(frame, RefinedKeyframe { valid: Some(valid.into()), ..keyframe });
+        // Sums in the order of the keyframes, a few of which are held at a time.
+        for keyframes in keyframes.chunks(AT_ONCE) {
+            let seen: Vec<_> = keyframes.par_iter().map(look).collect();
+            for ((frame, keyframe), (pinhole, coverage, part)) in keyframes.iter().zip(seen) {
+                for (block, gaussian, share) in &coverage.shares {
+                    let here = part.as_ref().is_some_and(|part| part.valid[*block as usize]);
+                    supervision[*gaussian as usize].add(*share, here);
+                }
+                let Some(PartView { valid, context }) = part else { continue };
+                context.into_iter().for_each(|gaussian| is_context[gaussian as usize] = true);
+                let valid = coverage.to_pixels(&valid, pinhole.width, pinhole.height);
+                chosen.insert(*frame, RefinedKeyframe { valid: Some(valid.into()), ..keyframe.clone() });
+            }
         }
         if chosen.is_empty() {
             return Err(PipelineError::NotSeen);
         }
         let mut part = cloud.emptied();
-        let context = (0..cloud.len()).filter(|&i| places[i] == Place::Beyond && is_context[i]);
-        context.for_each(|i| part.push(cloud.get(i)));
+        let moves = |i: usize| places[i] != Place::Beyond && supervision[i].is_enough();
+        let stays = |i: usize| !moves(i) && (places[i] != Place::Beyond || is_context[i]);
+        (0..cloud.len()).filter(|i| stays(*i)).for_each(|i| part.push(cloud.get(i)));
         let frozen = part.len();
-        (0..cloud.len()).filter(|&i| places[i] != Place::Beyond).for_each(|i| part.push(cloud.get(i)));
-        tracing::info!(keyframes = chosen.len(), gaussians = part.len() - frozen, context = frozen, "region");
+        (0..cloud.len()).filter(|i| moves(*i)).for_each(|i| part.push(cloud.get(i)));
+        tracing::info!(keyframes = chosen.len(), gaussians = part.len() - frozen, frozen, "region");
         Ok(Self { keyframes: chosen, map: InitialMap { cloud: Arc::new(part), frozen }, ..self })
     }
 }
@@ -107,10 +120,29 @@ fn camera_of(recording: &Recording, frame: usize, world_from_camera: &Se3) -> Vi
     ViewCamera { pinhole, camera_from_world: world_from_camera.inverse() }
 }
 
-/// The core of a region in a map of which the first `frozen` Gaussians belong to its context.
-pub(super) fn core_of(map: &GaussianCloud, frozen: usize, region: &Region) -> GaussianCloud {
+/// What all keyframes see of a Gaussian, and what those of a region see of it: blocks' light.
+#[derive(Clone, Copy, Debug, Default)]
+struct Supervision {
+    all: f32,
+    here: f32,
+}
+
+impl Supervision {
+    fn add(&mut self, share: f32, here: bool) {
+        self.all += share;
+        self.here += if here { share } else { 0.0 };
+    }
+
+    /// Whether the region's keyframes see nearly all of it that is seen: steps that are blind for the rest would spoil that.
+    fn is_enough(self) -> bool {
+        self.here >= LEAST_SUPERVISION * self.all
+    }
+}
+
+/// The core of a region in a map, refined or frozen.
+pub(super) fn core_of(map: &GaussianCloud, region: &Region) -> GaussianCloud {
     let mut core = map.emptied();
-    (frozen..map.len()).filter(|&i| region.place(map.means[i]) == Place::Core).for_each(|i| core.push(map.get(i)));
+    (0..map.len()).filter(|&i| region.place(map.means[i]) == Place::Core).for_each(|i| core.push(map.get(i)));
     core
 }
 

@@ -105,8 +105,7 @@ impl<'a> Scene<'a> {
     /// What of the final map is the run's result: all of it, or a region's core.
     pub fn result_of(&self, map: Arc<GaussianCloud>) -> Arc<GaussianCloud> {
         let region = self.recording.config().refined.as_ref().and_then(|refined| refined.region);
-        let Some((region, refined)) = region.zip(self.refined.as_ref()) else { return map };
-        Arc::new(core_of(&map, refined.map.frozen, &region))
+        region.map_or_else(|| map.clone(), |region| Arc::new(core_of(&map, &region)))
     }
 
     /// The frames that have something for the mapper, ascending.

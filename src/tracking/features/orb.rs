@@ -5,6 +5,8 @@
 //! threshold where there is no texture) and their orientation (intensity centroid) is done here, so that descriptors are computed
 //! only for those that stay. Levels are worked on in parallel, each by itself: the result does not depend on threads.
 
+use std::sync::Once;
+
 use nalgebra::Vector2;
 use opencv::core::{KeyPoint, KeyPointTraitConst, Mat, MatTraitConst, MatTraitConstManual, Rect, Size, Vector};
 use opencv::features2d::{self, Feature2DTrait};
@@ -84,8 +86,10 @@ struct Level {
 impl Extractor {
     /// `features` are kept of each image.
     pub fn new(width: u32, height: u32, features: usize, config: &TrackingConfig) -> Self {
-        // Frames and levels run side by side: threads of OpenCV's own are in their way. Only the speed depends on it.
-        let _ = opencv::core::set_num_threads(1);
+        // Frames and levels run side by side: threads of OpenCV's own are in their way. Only the speed depends on it. Once: OpenCV's pool must
+        // not be changed while another thread uses it.
+        static ONE_THREAD: Once = Once::new();
+        ONE_THREAD.call_once(|| drop(opencv::core::set_num_threads(1)));
         let scale = |level: usize| config.pyramid_scale.powi(level as i32);
         let total: f64 = (0..config.pyramid_levels).map(|l| 1.0 / scale(l)).sum();
         let levels = (0..config.pyramid_levels)
