@@ -49,6 +49,14 @@ impl Region {
         }
     }
 
+    /// Whether a sphere reaches through the region's border, from inside or outside.
+    pub fn border_crosses(&self, center: Vec3, radius: f32) -> bool {
+        let (low, high) = (Vec3::from(self.low), Vec3::from(self.high));
+        let outside = (low - center).max(center - high).max(Vec3::ZERO).length();
+        let inside = (center - low).min(high - center).min_element();
+        if outside > 0.0 { outside < radius } else { inside < radius }
+    }
+
     /// Checks every value.
     ///
     /// # Errors
@@ -72,7 +80,12 @@ mod tests {
         assert_eq!(region.place(Vec3::new(0.0, -1.0, 0.0)), Place::Core);
         assert_eq!(region.place(Vec3::new(2.0, 0.0, 1.0)), Place::Halo);
         assert_eq!(region.place(Vec3::new(1.0, 0.0, 4.6)), Place::Beyond);
-        assert!(region.validate().is_ok());
+        for (center, radius, crosses) in
+            [([0.25, 0.0, 2.0], 0.2, false), ([0.25, 0.0, 2.0], 0.3, true), ([5.0, 0.0, 8.0], 4.9, false)]
+        {
+            assert_eq!(region.border_crosses(Vec3::from(center), radius), crosses);
+        }
+        assert!(region.border_crosses(Vec3::new(5.0, 0.0, 8.0), 5.1) && region.validate().is_ok());
         for wrong in [
             Region { high: [2.0, -1.0, 4.0], ..region },
             Region { low: [f32::NAN; 3], ..region },

@@ -20,6 +20,8 @@ use crate::splat::{Exposure, GaussianCloud, ViewCamera};
 
 /// A Gaussian is refined with a region whose keyframes see this share of what all see of it.
 const LEAST_SUPERVISION: f32 = 0.8;
+/// Standard deviations of a Gaussian within which a border is its own.
+const BORDER_DEVIATIONS: f32 = 2.0;
 /// Keyframes looked at side by side.
 const AT_ONCE: usize = 64;
 
@@ -104,7 +106,10 @@ impl Refined {
             return Err(PipelineError::NotSeen);
         }
         let mut part = cloud.emptied();
-        let moves = |i: usize| places[i] != Place::Beyond && supervision[i].is_enough();
+        // What reaches through the border stays as it is on both sides: moved across it, it would be left twice, or not at all.
+        let is_shared =
+            |i: usize| region.border_crosses(cloud.means[i], BORDER_DEVIATIONS * cloud.log_scales[i].max_element().exp());
+        let moves = |i: usize| places[i] != Place::Beyond && supervision[i].is_enough() && !is_shared(i);
         let stays = |i: usize| !moves(i) && (places[i] != Place::Beyond || is_context[i]);
         (0..cloud.len()).filter(|i| stays(*i)).for_each(|i| part.push(cloud.get(i)));
         let frozen = part.len();
