@@ -94,6 +94,7 @@ later_run() { [ "$(ls -d "$plan"/tasks/*/result 2>/dev/null | wc -l)" -ge 1 ]; }
 
 new_plan() {
     local epochs=$1 count=$2
+    umount "$plan/tasks/0003" 2>/dev/null || true
     rm -rf "$plan" "$work/room"
     cp -r "$work/original" "$work/room"
     if [ "$kind" = cells ]; then

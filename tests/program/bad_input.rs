@@ -216,7 +216,7 @@ fn scenes() {
     let file = scratch().join("scene.toml");
     generate("seed = 1\n[camera]\nwitdh = 640\n").refused(&[file.to_str().unwrap(), "line 3", "witdh", "width"]);
     generate("fps = nan\n").refused(&[&format!("{}: `fps` is NaN", file.display()), "between 1 and 1000"]);
-    generate("[furniture]\npictures = 101\n").refused(&["furniture", "between 0 and 100"]);
+    generate("[furniture]\npictures = 401\n").refused(&["furniture", "between 0 and 400"]);
     let scene = write("good-scene.toml", &scene().to_toml());
     let again = finish(keysplat([Path::new("generate"), &scene, Path::new("--out"), recording()]));
     again.refused(&[recording().to_str().unwrap(), "is there already; remove it or write elsewhere"]);

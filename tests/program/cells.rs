@@ -80,8 +80,9 @@ fn cells_make_the_same_map_whatever_happens_and_a_hole_keeps_the_run() {
     let with_hole = jobs("merge", &killed, &["--allow-holes"]);
     assert_eq!(with_hole.code, Some(3));
     let left = map(&killed.join("merged"));
-    let kept = left.means.iter().filter(|mean| whole.means.contains(mean) && !all.means.contains(mean)).count();
-    assert!(kept > 0 && left.len() == all.len() - core.len() + kept, "{kept} {} {} {}", left.len(), all.len(), core.len());
+    let kept = left.len() - (all.len() - core.len());
+    let of_run = left.means.iter().filter(|mean| whole.means.contains(mean)).count();
+    assert!(kept > 0 && of_run >= kept && left.means != all.means, "{kept} {of_run}");
 }
 
 #[test]
