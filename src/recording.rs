@@ -133,6 +133,11 @@ impl Recording {
         self.sequence.camera.pinhole.scaled(self.config.map_scale)
     }
 
+    /// The same of frame `index`.
+    pub fn map_pinhole_of(&self, index: usize) -> Pinhole {
+        self.sequence.camera_of(index).pinhole.scaled(self.config.map_scale)
+    }
+
     /// The recording's own `world_from_camera` at a time in seconds, if one is near.
     pub fn known_pose(&self, timestamp_s: f64) -> Option<Se3> {
         let truth = self.sequence.groundtruth.as_ref()?;
@@ -157,10 +162,9 @@ impl Recording {
 
     fn check_size(&self) -> Result<(), RecordingError> {
         let least = SSIM_WINDOW as u32;
-        let cameras = (0..self.sequence.entries.len()).map(|index| self.sequence.camera_of(index));
-        let too_small = cameras
-            .map(|camera| camera.pinhole.scaled(self.config.map_scale))
-            .find(|Pinhole { width, height, .. }| *width.min(height) < least);
+        let pinholes = (0..self.sequence.entries.len()).map(|index| self.map_pinhole_of(index));
+        let mut pinholes = pinholes;
+        let too_small = pinholes.find(|Pinhole { width, height, .. }| *width.min(height) < least);
         too_small.map_or(Ok(()), |Pinhole { width, height, .. }| Err(RecordingError::TooSmall { width, height, least }))
     }
 

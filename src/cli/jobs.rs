@@ -9,7 +9,7 @@ use clap::{Args, Subcommand};
 use keysplat::jobs::{self, AGAIN, Ended, JobError, Plan, State, WITH_HOLES, kubernetes, local, slurm};
 use miette::{IntoDiagnostic, Report};
 
-pub use work::inputs_of_run;
+pub use work::{inputs_of_run, refining};
 
 use super::{Verbosity, print, print_error, progress};
 

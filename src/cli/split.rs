@@ -9,9 +9,6 @@ use miette::{IntoDiagnostic, miette};
 
 use super::jobs;
 
-/// An end beyond is none, metres.
-const FAR: f32 = 1e5;
-
 #[derive(Args)]
 pub struct SplitArgs {
     /// Folder of a finished run.
@@ -40,18 +37,17 @@ pub fn split(args: &SplitArgs) -> miette::Result<()> {
     }
     let found = split_run(&args.run, &SplitOptions { size, halo, max_gaussians }).into_diagnostic()?;
     let mut draft = Draft::new(&args.out).into_diagnostic()?;
-    let mut inputs = vec![draft.input(&found.recording).into_diagnostic()?];
-    for file in &found.files {
+    let mut inputs = Vec::new();
+    let read = jobs::inputs_of_run(&found.recording, &jobs::refining(&args.run, &args.options))?;
+    // Of the run's folder, single files: the others may change.
+    for file in read.iter().filter(|path| **path != found.run).chain(&found.files) {
         inputs.push(draft.input(file).into_diagnostic()?);
     }
     let (run, recording) = (draft.place(&args.run).into_diagnostic()?, draft.place(&found.recording).into_diagnostic()?);
     for Cell { region, gaussians, keyframes } in found.cells {
-        let end = |value: f32| if value.abs() < FAR { format!("{value:.1}") } else { String::new() };
-        let [x, y, z] = [0, 1, 2].map(|axis| format!("{}..{}", end(region.low[axis]), end(region.high[axis])));
-        tracing::info!(gaussians, keyframes, "cell x {x}, y {y}, z {z}");
+        tracing::info!(gaussians, keyframes, "cell {region}");
         let task = CellTask { run: run.clone(), recording: recording.clone(), region, options: args.options.clone() };
-        let name = format!("x {x}, y {y}, z {z}");
-        draft.task(Task { name, seed: 0, inputs: inputs.clone(), work: Work::Cell(task) });
+        draft.task(Task { name: region.to_string(), seed: 0, inputs: inputs.clone(), work: Work::Cell(task) });
     }
     jobs::print_plan(&draft.finish().into_diagnostic()?)
 }

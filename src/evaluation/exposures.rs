@@ -1,5 +1,8 @@
 //! A run's exposures over time: those of its keyframes, and in between.
 
+use std::io::ErrorKind;
+use std::path::Path;
+
 use serde::{Deserialize, Serialize};
 
 use crate::splat::Exposure;
@@ -25,6 +28,18 @@ impl Exposures {
     pub fn new(mut records: Vec<ExposureRecord>) -> Self {
         records.sort_by(|a, b| a.timestamp_s.total_cmp(&b.timestamp_s));
         Self(records)
+    }
+
+    /// Reads the file of a run; nothing where the run estimated none.
+    ///
+    /// # Errors
+    /// What is wrong with the file.
+    pub fn read(path: &Path) -> Result<Self, String> {
+        match std::fs::read_to_string(path) {
+            Ok(text) => Self::parse(&text).ok_or_else(|| "does not hold exposures".into()),
+            Err(error) if error.kind() == ErrorKind::NotFound => Ok(Self::default()),
+            Err(error) => Err(format!("cannot be read: {error}")),
+        }
     }
 
     /// From its JSON; `None` if that is something else, or holds what no camera does.

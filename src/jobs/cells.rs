@@ -9,7 +9,7 @@ use super::input::create_folder;
 use super::merge::read;
 use super::task::result_folder;
 use super::{CellTask, JobError, Plan, Work};
-use crate::export::ExportError;
+use crate::export::{ExportError, MapFormat};
 use crate::files::write_atomically;
 use crate::geometry::{Se3, Trajectory};
 use crate::partition::Place;
@@ -87,7 +87,7 @@ fn of_cell((number, task): (usize, &super::Task)) -> Option<(usize, &CellTask)> 
     }
 }
 
-fn map_of(folder: &Path) -> Result<(GaussianCloud, crate::export::MapFormat), JobError> {
+fn map_of(folder: &Path) -> Result<(GaussianCloud, MapFormat), JobError> {
     let missing = || std::io::Error::from(std::io::ErrorKind::NotFound);
     let none = || JobError::Read { path: folder.join(outputs::map_name(Default::default())), source: missing() };
     let (path, format) = outputs::find_map(folder).ok_or_else(none)?;

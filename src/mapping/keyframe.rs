@@ -31,7 +31,7 @@ pub struct Keyframe {
     pub depth_source: DepthSource,
     /// Earlier keyframes that see the same landmarks, strongest first.
     pub covisible: Vec<KeyframeId>,
-    /// Exposure against the map's, where that is known: of a finished run, whose map has Gaussians for all that it shows.
+    /// Its exposure, if it is of a finished run: the keyframe is then only taken in, and nothing is measured or inserted.
     pub exposure: Option<Exposure>,
 }
 

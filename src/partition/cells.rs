@@ -5,10 +5,7 @@
 
 use glam::Vec3;
 
-use super::Region;
-
-/// Beyond all Gaussians, metres.
-const FAR: f32 = 1e6;
+use super::{FAR, Region};
 
 /// Divides space: the longest side of the cameras' bounding box is halved while it exceeds `size` metres, and a part with more than `most` Gaussian centres is
 /// divided at their median. The outermost parts have no end. Parts without centres are left out; the others have each finite centre in exactly one.

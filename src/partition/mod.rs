@@ -5,14 +5,16 @@
 
 mod cells;
 mod coverage;
-mod part;
+mod visibility;
+
+use std::fmt::{self, Display};
 
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
 pub use cells::cells;
 pub use coverage::{BLOCK, Coverage};
-pub use part::{PartView, cameras_that_see};
+pub use visibility::{RegionView, cameras_that_see};
 
 /// An axis-aligned box of the map's world, and how far around it the map is refined with it; metres.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -25,6 +27,9 @@ pub struct Region {
     /// Width of its surroundings that are refined, too.
     pub halo: f32,
 }
+
+/// Beyond all Gaussians, metres: a bound there is none.
+const FAR: f32 = 1e6;
 
 /// Where a Gaussian lies, for a region.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -70,6 +75,14 @@ impl Region {
     }
 }
 
+impl Display for Region {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let end = |value: f32| if value.abs() < FAR { format!("{value:.1}") } else { String::new() };
+        let [x, y, z] = [0, 1, 2].map(|axis| format!("{}..{}", end(self.low[axis]), end(self.high[axis])));
+        write!(f, "x {x}, y {y}, z {z}")
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -85,6 +98,7 @@ mod tests {
         {
             assert_eq!(region.border_crosses(Vec3::from(center), radius), crosses);
         }
+        assert_eq!(Region { high: [FAR, 1.0, 4.0], ..region }.to_string(), "x 0.0.., y -1.0..1.0, z 0.0..4.0");
         assert!(region.border_crosses(Vec3::new(5.0, 0.0, 8.0), 5.1) && region.validate().is_ok());
         for wrong in [
             Region { high: [2.0, -1.0, 4.0], ..region },

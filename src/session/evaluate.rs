@@ -105,12 +105,8 @@ pub(super) fn nearest_frames(sequence: &Sequence, trajectory: &Trajectory) -> Ve
 /// Exposures of the run, if it estimated any.
 fn exposures(folder: &Path) -> Result<Exposures, SessionError> {
     let path = folder.join(outputs::EXPOSURES);
-    if !path.is_file() {
-        return Ok(Exposures::default());
-    }
-    let text = std::fs::read_to_string(&path).map_err(|error| unreadable(&path, format!("cannot be read: {error}")))?;
-    let advice = "does not hold exposures; move it away to compare with the map's own colours";
-    Exposures::parse(&text).ok_or_else(|| unreadable(&path, advice))
+    let advice = "move it away to compare with the map's own colours";
+    Exposures::read(&path).map_err(|reason| unreadable(&path, format!("{reason}; {advice}")))
 }
 
 pub(super) fn earlier_metrics(folder: &Path) -> Result<Option<Metrics>, SessionError> {

@@ -7,6 +7,7 @@ use glam::Vec3;
 use super::SessionError;
 use super::evaluate::{nearest_frames, read_trajectory};
 use crate::config::Config;
+use crate::geometry::Se3;
 use crate::partition::{Place, Region, cameras_that_see, cells};
 use crate::recording::{Recording, RecordingError};
 use crate::run_folder::outputs;
@@ -37,6 +38,8 @@ pub struct Cell {
 /// A run and its cells.
 #[derive(Clone, Debug)]
 pub struct Split {
+    /// The run's folder, absolute.
+    pub run: PathBuf,
     /// The run's recording.
     pub recording: PathBuf,
     /// Files of the run that a refinement reads.
@@ -58,11 +61,9 @@ pub fn split_run(run: &Path, options: &SplitOptions) -> Result<Split, SessionErr
     let map = format.read(&map_file).map_err(outputs::OutputError::from)?;
     let sequence = recording.sequence();
     let keyframes = nearest_frames(sequence, &read_trajectory(&run.join(outputs::KEYFRAMES))?);
-    let scale = recording.config().map_scale;
-    let camera = |(frame, world_from_camera): &(usize, _)| {
-        let world_from_camera: &crate::geometry::Se3 = world_from_camera;
-        let pinhole = sequence.camera_of(*frame).pinhole.scaled(scale);
-        ViewCamera { pinhole, camera_from_world: world_from_camera.inverse() }
+    let camera = |(frame, world_from_camera): &(usize, Se3)| ViewCamera {
+        pinhole: recording.map_pinhole_of(*frame),
+        camera_from_world: world_from_camera.inverse(),
     };
     let cameras: Vec<ViewCamera> = keyframes.iter().map(camera).collect();
     let position =
@@ -81,5 +82,5 @@ pub fn split_run(run: &Path, options: &SplitOptions) -> Result<Split, SessionErr
     let own = [outputs::CONFIG, outputs::TRAJECTORY, outputs::KEYFRAMES, outputs::EXPOSURES].map(|name| run.join(name));
     let files = own.into_iter().chain([map_file]).filter(|file| file.is_file()).collect();
     let recording = recording.config().sequence.clone().unwrap_or_default().path;
-    Ok(Split { recording, files, cells })
+    Ok(Split { run, recording, files, cells })
 }

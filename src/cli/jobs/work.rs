@@ -200,13 +200,18 @@ fn map_name(folder: &Path) -> Option<String> {
     outputs::find_map(folder).and_then(|(map, _)| Some(map.file_name()?.to_string_lossy().into_owned()))
 }
 
-/// Options of the run that refines a cell.
+/// Options of a run that refines another. The map is lossless, whatever the format of the merged one.
+pub fn refining(run: &Path, options: &[String]) -> Vec<String> {
+    let own = ["--refine".into(), run.to_string_lossy().into_owned(), "--format".into(), "ply".into()];
+    options.iter().cloned().chain(own).collect()
+}
+
+/// The same for one cell.
 fn options_of_cell(plan: &Plan, cell: &CellTask) -> Result<Vec<String>, toml::ser::Error> {
     let mut region = String::new();
     serde::Serialize::serialize(&cell.region, toml::ser::ValueSerializer::new(&mut region))?;
-    let run = plan.folder().join(&cell.run).to_string_lossy().into_owned();
-    let own = ["--refine".into(), run, "--set".into(), format!("refined.region={region}")];
-    Ok(own.into_iter().chain(cell.options.iter().cloned()).collect())
+    let of_cell = ["--set".into(), format!("refined.region={region}")];
+    Ok(refining(&plan.folder().join(&cell.run), &cell.options).into_iter().chain(of_cell).collect())
 }
 
 fn write_cell(session: &Session, replay: Replay, folder: &Path) -> Result<(), SessionError> {

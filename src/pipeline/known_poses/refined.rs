@@ -1,7 +1,7 @@
 //! A finished run that is refined: its poses, its exposures and its map, or the part of them that a region needs.
 
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use rayon::prelude::*;
@@ -11,7 +11,7 @@ use crate::evaluation::Exposures;
 use crate::evaluation::trajectory::MAX_TIME_DIFFERENCE_S;
 use crate::geometry::{Se3, StampedPose, Trajectory};
 use crate::mapping::InitialMap;
-use crate::partition::{Coverage, PartView, Place, Region};
+use crate::partition::{Coverage, Place, Region, RegionView};
 use crate::pipeline::PipelineError;
 use crate::recording::Recording;
 use crate::run_folder::outputs;
@@ -62,7 +62,8 @@ impl Refined {
             }
             Ok(found)
         };
-        let exposures = exposures(&config.run.join(outputs::EXPOSURES)).map_err(|(path, reason)| wrong(path, reason))?;
+        let exposures_file = config.run.join(outputs::EXPOSURES);
+        let exposures = Exposures::read(&exposures_file).map_err(|reason| wrong(exposures_file, reason))?;
         let keyframe = |(frame, pose): (usize, StampedPose)| {
             let exposure = exposures.at(pose.timestamp_s);
             (frame, RefinedKeyframe { world_from_camera: pose.world_from_camera, exposure, valid: None })
@@ -81,10 +82,11 @@ impl Refined {
         let places: Vec<Place> = cloud.means.iter().map(|mean| region.place(*mean)).collect();
         let keyframes: Vec<(usize, RefinedKeyframe)> = self.keyframes.into_iter().collect();
         let look = |(frame, keyframe): &(usize, RefinedKeyframe)| {
-            let camera = camera_of(recording, *frame, &keyframe.world_from_camera);
+            let pinhole = recording.map_pinhole_of(*frame);
+            let camera = ViewCamera { pinhole, camera_from_world: keyframe.world_from_camera.inverse() };
             let coverage = Coverage::of(cloud, &camera);
-            let part = PartView::of(&coverage, &places);
-            (camera.pinhole, coverage, part)
+            let part = RegionView::of(&coverage, &places);
+            (pinhole, coverage, part)
         };
         let (mut is_context, mut supervision) = (vec![false; cloud.len()], vec![Supervision::default(); cloud.len()]);
         let mut chosen = BTreeMap::new();
@@ -96,7 +98,7 @@ impl Refined {
                     let here = part.as_ref().is_some_and(|part| part.valid[*block as usize]);
                     supervision[*gaussian as usize].add(*share, here);
                 }
-                let Some(PartView { valid, context }) = part else { continue };
+                let Some(RegionView { valid, context }) = part else { continue };
                 context.into_iter().for_each(|gaussian| is_context[gaussian as usize] = true);
                 let valid = coverage.to_pixels(&valid, pinhole.width, pinhole.height);
                 chosen.insert(*frame, RefinedKeyframe { valid: Some(valid.into()), ..keyframe.clone() });
@@ -117,12 +119,6 @@ impl Refined {
         tracing::info!(keyframes = chosen.len(), gaussians = part.len() - frozen, frozen, "region");
         Ok(Self { keyframes: chosen, map: InitialMap { cloud: Arc::new(part), frozen }, ..self })
     }
-}
-
-/// A frame's camera at the mapping resolution.
-fn camera_of(recording: &Recording, frame: usize, world_from_camera: &Se3) -> ViewCamera {
-    let pinhole = recording.sequence().camera_of(frame).pinhole.scaled(recording.config().map_scale);
-    ViewCamera { pinhole, camera_from_world: world_from_camera.inverse() }
 }
 
 /// What all keyframes see of a Gaussian, and what those of a region see of it: blocks' light.
@@ -156,13 +152,4 @@ fn frames(sequence: &Sequence, trajectory: &Trajectory) -> Vec<(usize, StampedPo
     let nearest = |pose: &StampedPose| Some((sequence.nearest(pose.timestamp_s, MAX_TIME_DIFFERENCE_S)?, *pose));
     let found: BTreeMap<usize, StampedPose> = trajectory.poses.iter().filter_map(nearest).collect();
     found.into_iter().collect()
-}
-
-/// The run's exposures; none where it did not estimate them.
-fn exposures(path: &Path) -> Result<Exposures, (PathBuf, String)> {
-    match std::fs::read_to_string(path) {
-        Ok(text) => Exposures::parse(&text).ok_or_else(|| (path.into(), "does not hold exposures".into())),
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(Exposures::default()),
-        Err(error) => Err((path.into(), error.to_string())),
-    }
 }

@@ -1,4 +1,4 @@
-//! What cameras see of a part of a map.
+//! What cameras see of a region.
 
 use glam::Vec3;
 use rayon::prelude::*;
@@ -13,14 +13,14 @@ const LEAST_SHARE: f32 = 0.01;
 
 /// What a camera that sees a region has in its image.
 #[derive(Clone, Debug, PartialEq)]
-pub struct PartView {
+pub struct RegionView {
     /// Blocks, row-major, that show the region or its halo more than what lies beyond.
     pub valid: Vec<bool>,
     /// Gaussians beyond the halo in and around these blocks, in any order and more than once.
     pub context: Vec<u32>,
 }
 
-impl PartView {
+impl RegionView {
     /// What a camera has of a region, when each Gaussian has this place; `None` if it does not see the region.
     pub fn of(coverage: &Coverage, places: &[Place]) -> Option<Self> {
         let (mut near, mut beyond) = (vec![0.0f32; coverage.blocks()], vec![0.0f32; coverage.blocks()]);
@@ -97,14 +97,14 @@ mod tests {
         let cloud = wall();
         let region = region(0.0, 2.0);
         let places: Vec<Place> = cloud.means.iter().map(|mean| region.place(*mean)).collect();
-        let seen = PartView::of(&Coverage::of(&cloud, &camera(0.0)), &places).unwrap();
+        let seen = RegionView::of(&Coverage::of(&cloud, &camera(0.0)), &places).unwrap();
         // The border lies in the middle of the image, and the halo is one block wide.
         for (block, valid) in seen.valid.iter().enumerate() {
             assert_eq!(*valid, block % 8 >= 3, "{block}");
         }
         let context: Vec<f32> = seen.context.iter().map(|gaussian| cloud.means[*gaussian as usize].x).collect();
         assert!(!context.is_empty() && context.iter().all(|x| (-0.9..-0.25).contains(x)), "{context:?}");
-        assert_eq!(PartView::of(&Coverage::of(&cloud, &camera(-1.5)), &places), None);
+        assert_eq!(RegionView::of(&Coverage::of(&cloud, &camera(-1.5)), &places), None);
     }
 
     #[test]
