@@ -228,7 +228,9 @@ impl Session {
         } else if !sequence.path.exists() {
             return Err(SessionError::Moved { path: sequence.path.clone() });
         }
-        Ok(Self { checkpoint: Some(checkpoint), ..Self::open(config, out)? })
+        let mut session = Self::open(config, out)?;
+        session.checkpoint = Some(checkpoint);
+        Ok(session)
     }
 
     /// The recording with its resolved configuration.
@@ -267,7 +269,8 @@ impl Session {
             "replaying into {}",
             self.out.display()
         );
-        Ok(pipeline::run(&self.recording, &self.gpu, progress, checkpointer)?)
+        let chunks = self.out.join(outputs::CHUNKS);
+        Ok(pipeline::run(&self.recording, &self.gpu, progress, checkpointer, Some(&chunks))?)
     }
 
     /// Writes and measures a replay, even a partial one, and removes the checkpoint of one that reached its end. `on_view` receives the number of
@@ -338,6 +341,15 @@ impl Session {
             None => SessionError::NothingTracked {
                 advice: "the images need texture, and depth between tracking.min_depth_metres and tracking.max_depth_metres",
             },
+        }
+    }
+}
+
+impl Drop for Session {
+    /// Gaussians on the disk are of no use without a checkpoint.
+    fn drop(&mut self) {
+        if !self.out.join(outputs::CHECKPOINT).exists() {
+            let _ = std::fs::remove_file(self.out.join(outputs::CHUNKS));
         }
     }
 }

@@ -184,6 +184,21 @@ pub struct MappingFigures {
     pub map_width: u32,
     /// Height of these images, pixels.
     pub map_height: u32,
+    /// Where the map was larger than the adapter's memory.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub paging: Option<PagingFigures>,
+}
+
+/// Gaussians that left the adapter for the disk.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PagingFigures {
+    /// Those that left, counted each time.
+    pub gaussians_out: u64,
+    /// Those that came back.
+    pub gaussians_in: u64,
+    /// The most that were on the disk at a time.
+    pub most_away: u64,
 }
 
 /// The GPU, or what stands in for it.

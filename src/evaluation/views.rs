@@ -15,7 +15,7 @@ use super::image::{ImageF32, depth_l1, psnr, psnr_where_lit, ssim};
 use super::metrics::{ImageMeans, ImageProtocols};
 use crate::geometry::Se3;
 use crate::gpu::{Gpu, GpuError};
-use crate::render::{GpuCloud, Rasterizer, Rendered};
+use crate::render::{MapRenderer, Rendered};
 use crate::sequence::{RectifiedImage, Rectifier, Rectifiers, Sequence};
 use crate::splat::GaussianCloud;
 use crate::splat::ViewCamera;
@@ -142,6 +142,8 @@ pub struct ViewSource<'a> {
     pub gpu: &'a Arc<Gpu>,
     /// The map.
     pub cloud: &'a GaussianCloud,
+    /// Most of its Gaussians on the adapter at a time.
+    pub most_gaussians: usize,
     /// Whose depth is compared.
     pub surface: Surface,
 }
@@ -164,14 +166,13 @@ pub fn evaluate_views(
     on_held_out: &(dyn Fn(&ComparedView) + Sync),
     on_view: &dyn Fn(usize),
 ) -> Result<(ImageProtocols, Vec<ViewRecord>), GpuError> {
-    let ViewSource { sequence, map_scale, gpu, cloud, surface } = source;
+    let ViewSource { sequence, map_scale, gpu, cloud, most_gaussians, surface } = source;
     let mut rectifiers = Rectifiers::new(map_scale);
-    let mut rasterizer = Rasterizer::of_surface(gpu.clone(), surface)?;
-    let on_gpu = GpuCloud::of(gpu, cloud)?;
+    let mut renderer = MapRenderer::new(gpu, cloud, surface, most_gaussians)?;
     let mut load = |poses: &[(usize, Se3)]| load_views(sequence, &mut rectifiers, poses);
     let mut render = |recorded: Vec<RecordedView>| -> Result<Vec<(RecordedView, Rendered)>, GpuError> {
         let camera = |v: &RecordedView| ViewCamera { pinhole: v.image.pinhole, camera_from_world: v.world_from_camera.inverse() };
-        recorded.into_iter().map(|view| rasterizer.render(&on_gpu, &camera(&view), [0.0; 3]).map(|r| (view, r))).collect()
+        recorded.into_iter().map(|view| renderer.render(&camera(&view)).map(|r| (view, r))).collect()
     };
     let compare = |views: Vec<_>| -> Vec<Compared> {
         views.into_par_iter().map(|view| compare_view(sequence, selection, view, on_held_out)).collect()

@@ -6,6 +6,7 @@
 //! small ones.
 
 use nalgebra::{Isometry3, Matrix3, Point3, SMatrix, SVector, Translation3, UnitQuaternion, Vector3};
+use serde::{Deserialize, Serialize};
 
 use super::se3::{Se3, skew};
 
@@ -18,7 +19,7 @@ pub type Matrix7 = SMatrix<f64, 7, 7>;
 const SERIES_TERMS: usize = 40;
 
 /// A similarity; its action is `p_in_a = scale * rotation * p_in_b + translation`.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Sim3 {
     /// a_from_b, unit length.
     pub rotation: UnitQuaternion<f64>,

@@ -47,6 +47,16 @@ impl Anchors {
         (0..).zip(&self.0).filter(|(_, keyframe)| keyframes.contains(keyframe)).map(|(gaussian, _)| gaussian).collect()
     }
 
+    /// Gaussians that come back, of these keyframes.
+    pub fn put_back(&mut self, keyframes: &[KeyframeId]) {
+        self.0.extend_from_slice(keyframes);
+    }
+
+    /// The keyframes of some Gaussians.
+    pub fn at(&self, places: &[u32]) -> Vec<KeyframeId> {
+        places.iter().map(|place| self.0[*place as usize]).collect()
+    }
+
     pub fn len(&self) -> usize {
         self.0.len()
     }

@@ -1,5 +1,7 @@
 //! Failures of the mapper.
 
+use std::path::PathBuf;
+
 use super::KeyframeId;
 use crate::gpu::GpuError;
 
@@ -37,6 +39,14 @@ pub enum MappingError {
         "cannot read the images of earlier keyframes back from the temporary folder ({0}); raise --max-host-memory, or set TMPDIR to another folder"
     )]
     Images(#[from] std::io::Error),
+    /// Gaussians that left the GPU cannot be read back.
+    #[error("{path}, which holds Gaussians that left the GPU, {reason}; raise --max-gpu-memory, or make the run anew")]
+    Chunks {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        reason: String,
+    },
     /// The checkpoint's parts contradict each other.
     #[error("the mapper's state contradicts itself")]
     State,

@@ -8,6 +8,7 @@ use image::GrayImage;
 use serde::{Deserialize, Serialize};
 
 use super::anchors;
+use super::chunks::{Outlook, Sight};
 use super::image_store::ImageStore;
 use super::plane_sweep::{self, SourceView};
 use super::{KeyframeId, MappingError, PoseUpdate};
@@ -88,6 +89,8 @@ pub(super) struct MappedKeyframe {
     image: Images,
     /// On the host, where depth is swept for.
     gray: Option<GrayImage>,
+    /// How far it sees.
+    sight: Sight,
     pub covisible: Vec<KeyframeId>,
 }
 
@@ -124,6 +127,7 @@ impl MappedKeyframe {
             exposure: Exposure::default(),
             image: Images::new(gpu, image, with_half)?,
             gray: matches!(keyframe.depth_source, DepthSource::Landmarks { .. }).then(|| plane_sweep::gray(&image.color)),
+            sight: Sight::of(image),
             covisible: keyframe.covisible.clone(),
         })
     }
@@ -168,6 +172,7 @@ impl MappedKeyframe {
             exposure: state.exposure,
             gray: state.swept.as_ref().map(|_| plane_sweep::gray(&image.color)),
             image: images,
+            sight: Sight::of(image),
             covisible: state.covisible.clone(),
         };
         if !state.is_resident {
@@ -188,6 +193,7 @@ impl MappedKeyframe {
             (self.anchored_from_world, self.scale_since_anchor) = (camera_from_world, 1.0);
             if scale != 1.0 && self.depth_is_estimated() {
                 self.image.scale_depth(gpu, store, scale)?;
+                self.sight.scale(scale as f32);
             }
         }
         Ok(motion)
@@ -228,6 +234,11 @@ impl MappedKeyframe {
     /// Whether its depth, if any, was estimated and not measured.
     pub fn depth_is_estimated(&self) -> bool {
         self.gray.is_some()
+    }
+
+    /// What it sees from where it is.
+    pub fn outlook(&self) -> Outlook<'_> {
+        self.sight.from(&self.camera)
     }
 
     /// View of the plane sweep.

@@ -4,7 +4,8 @@
 use serde::{Deserialize, Serialize};
 
 use super::keyframe::MappedKeyframe;
-use crate::render::GaussianHistory;
+use crate::render::{GaussianHistory, GpuCloud};
+use crate::splat::ShDegree;
 
 /// Bytes that the rasterizer's scratch, the scores and the verdicts take for each Gaussian.
 pub(super) const SCRATCH_BYTES_EACH: u64 = 128;
@@ -46,11 +47,24 @@ impl LimitsConfig {
         self.max_gaussians.is_some() || self.max_gpu_bytes.is_some()
     }
 
-    /// The most Gaussians, of `bytes_each` in the map, when buffers that don't depend on their number take `other_bytes`.
-    pub(super) fn gaussians(&self, bytes_each: u64, other_bytes: u64) -> usize {
+    /// The most Gaussians on the GPU by their number in the whole map, when `away` are elsewhere.
+    pub(super) fn gaussians(&self, away: usize) -> usize {
+        self.max_gaussians.map_or(usize::MAX, |most| most.saturating_sub(away).max(LEAST_GAUSSIANS))
+    }
+
+    /// The most by memory, of `bytes_each` in the map, when buffers that don't depend on their number take `other_bytes`.
+    pub(super) fn gaussians_on_gpu(&self, bytes_each: u64, other_bytes: u64) -> usize {
         let each = bytes_each + SCRATCH_BYTES_EACH + LIST_BYTES_EACH;
         let by_memory = self.max_gpu_bytes.map_or(usize::MAX, |limit| (limit.saturating_sub(other_bytes) / each) as usize);
-        self.max_gaussians.unwrap_or(usize::MAX).min(by_memory).max(LEAST_GAUSSIANS)
+        by_memory.max(LEAST_GAUSSIANS)
+    }
+
+    /// The most Gaussians of a finished map that may be on the adapter to be rendered, when it has `gpu_bytes` in use: half of what is left is for what
+    /// the views need.
+    pub fn most_rendered(&self, gpu_bytes: u64, sh_degree: ShDegree) -> usize {
+        let each = GpuCloud::bytes_for_each(sh_degree) + SCRATCH_BYTES_EACH;
+        let most = |limit: u64| (limit.saturating_sub(gpu_bytes) / 2 / each) as usize;
+        self.max_gpu_bytes.map_or(usize::MAX, most).max(LEAST_GAUSSIANS)
     }
 
     /// Bytes of `bytes` in use that don't depend on the number of Gaussians, when a map with room for `capacity` has `map_bytes`.
@@ -139,9 +153,10 @@ mod tests {
     fn memory_is_shared_by_images_and_gaussians() {
         let limits = LimitsConfig { max_gpu_bytes: Some(100_000_000), ..LimitsConfig::default() };
         assert_eq!(limits.gpu_images(1_000_000), 40);
-        let most = limits.gaussians(672, 40_000_000);
+        let most = limits.gaussians_on_gpu(672, 40_000_000);
         assert!((74_000..76_000).contains(&most), "{most}");
-        assert_eq!(LimitsConfig { max_gaussians: Some(5000), ..limits }.gaussians(672, 0), 5000);
+        let bounded = LimitsConfig { max_gaussians: Some(5000), ..limits };
+        assert_eq!([0, 1000, 6000].map(|away| bounded.gaussians(away)), [5000, 4000, LEAST_GAUSSIANS]);
         assert!(LimitsConfig { max_gaussians: Some(5), ..LimitsConfig::default() }.validate().is_err());
     }
 }

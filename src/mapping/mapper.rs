@@ -4,12 +4,14 @@ mod control;
 mod corrections;
 mod exposures;
 mod interlude;
+mod paging;
 mod refine;
 mod start;
 mod state;
 mod within_limits;
 
 use std::borrow::Cow;
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -18,10 +20,12 @@ use fastrand::Rng;
 use serde::{Deserialize, Serialize};
 
 pub use interlude::Interlude;
+pub use paging::PagedOut;
 pub use refine::{FinalRefinement, RefineReport};
 pub use state::MapperState;
 
 use super::anchors::Anchors;
+use super::chunks::{Chunks, PagingFigures};
 use super::host_time::HostTimes;
 use super::image_store::ImageStore;
 use super::insertion::Candidates;
@@ -74,6 +78,11 @@ pub struct Mapper {
     trainer: Trainer,
     cloud: GpuCloud,
     anchors: Anchors,
+    chunks: Chunks,
+    /// Keyframes whose views need what they see on the GPU at present, the most important first.
+    needing: Vec<usize>,
+    /// Epochs of each keyframe in a final refinement that moves chunks.
+    visits: Vec<u32>,
     density: DensityPasses,
     keyframes: Vec<MappedKeyframe>,
     /// Images beyond those on the GPU.
@@ -89,6 +98,8 @@ pub struct Mapper {
     has_initial_map: bool,
     /// Whether the adapter has no room for more Gaussians, which is reported once.
     is_full: bool,
+    /// Whether a keyframe has seen more than the GPU has room for, which is reported once.
+    is_short: bool,
 }
 
 impl Mapper {
@@ -106,6 +117,9 @@ impl Mapper {
             trainer: Trainer::with_blending(gpu.clone(), blending)?.with_planar(config.planar),
             cloud: GpuCloud::new(&gpu, config.sh_degree, FIRST_CAPACITY)?.with_antialiasing(config.antialiased),
             anchors: Anchors::default(),
+            chunks: Chunks::begin(None, false),
+            needing: Vec::new(),
+            visits: Vec::new(),
             density: DensityPasses::new(&gpu)?,
             keyframes: Vec::new(),
             images: ImageStore::new(config.limits.max_host_bytes),
@@ -116,9 +130,16 @@ impl Mapper {
             controlled_at: 0,
             has_initial_map: false,
             is_full: false,
+            is_short: false,
             config: Arc::new(config),
             gpu,
         })
+    }
+
+    /// Gaussians that leave the GPU go to this file and not to an unnamed temporary one. Where it is `lasting`, those that the last checkpoint names
+    /// stay until [`Self::checkpoint_is_written`]. The file of an earlier run is removed.
+    pub fn with_chunks(self, file: Option<PathBuf>, lasting: bool) -> Self {
+        Self { chunks: Chunks::begin(file, lasting), ..self }
     }
 
     /// Takes in a keyframe: inserts what the map lacks, optimises over the window, prunes. `interlude` comes between the steps. A keyframe
@@ -137,18 +158,19 @@ impl Mapper {
             mapped.exposure = exposure;
             self.keyframes.push(mapped);
             self.limit_gpu_images()?;
-            return Ok(KeyframeReport { id: keyframe.id, gaussians: self.cloud.len(), exposure, ..KeyframeReport::default() });
+            return Ok(KeyframeReport { id: keyframe.id, gaussians: self.gaussians(), exposure, ..KeyframeReport::default() });
         }
+        self.keyframes.push(mapped);
+        self.timed("paging", Self::page_for_window)?;
         let config = self.config.clone();
         let (candidates, survey) = std::thread::scope(|scope| {
             let candidates = scope.spawn(|| Candidates::new(&keyframe.image, &config.insertion));
-            let survey = self.timed("survey", |mapper| mapper.survey(&mapped, keyframe.image.depth.is_some()));
+            let survey = self.timed("survey", |mapper| mapper.survey(keyframe.image.depth.is_some()));
             (candidates.join().expect("the candidates are found"), survey)
         });
         let survey = survey?;
         let exposure = self.timed("exposure", |mapper| mapper.exposure(&keyframe.image, survey.as_ref()));
-        mapped.exposure = exposure;
-        self.keyframes.push(mapped);
+        self.keyframes.last_mut().into_iter().for_each(|newest| newest.exposure = exposure);
         self.limit_gpu_images()?;
         let insert =
             |mapper: &mut Self, candidates| mapper.insert_gaussians(&keyframe, &candidates, (survey.as_ref(), &exposure));
@@ -159,24 +181,26 @@ impl Mapper {
             return Ok(KeyframeReport {
                 id: keyframe.id,
                 inserted,
-                gaussians: self.cloud.len(),
+                gaussians: self.gaussians(),
                 exposure,
                 ..KeyframeReport::default()
             });
         }
         let report = self.optimise(iterations, interlude)?;
-        Ok(KeyframeReport { id: keyframe.id, inserted, gaussians: self.cloud.len(), exposure, ..report })
+        Ok(KeyframeReport { id: keyframe.id, inserted, gaussians: self.gaussians(), exposure, ..report })
     }
 
     /// Downloads the averaged parameters of all Gaussians. Blocks until the GPU is idle.
     ///
     /// # Errors
-    /// [`MappingError`] if a buffer does not fit or the device fails.
+    /// [`MappingError`] if a buffer does not fit, the device fails, or Gaussians cannot be read back from the disk.
     pub fn download(&self) -> Result<GaussianCloud, MappingError> {
-        Ok(self.cloud.download(&self.gpu)?)
+        let mut map = self.cloud.download(&self.gpu)?;
+        self.chunks.complete(&mut map, &self.chunks.away())?;
+        Ok(map)
     }
 
-    /// Renders the map over black.
+    /// Renders what is on the GPU over black.
     ///
     /// # Errors
     /// [`MappingError`] if a buffer does not fit or the device fails.
@@ -221,13 +245,29 @@ impl Mapper {
         self.keyframes.is_empty() && self.cloud.is_empty()
     }
 
-    /// Number of Gaussians in the map.
+    /// Number of Gaussians in the map, those on the disk included.
     pub fn gaussians(&self) -> usize {
-        self.cloud.len()
+        self.cloud.len() + self.chunks.gaussians_away()
     }
 
-    /// The map seen from a keyframe, if it is compared with it: by its depth or to find its exposure.
-    fn survey(&mut self, keyframe: &MappedKeyframe, has_depth: bool) -> Result<Option<Survey>, MappingError> {
+    /// Whether Gaussians have left the GPU at any time.
+    pub fn has_paged_out(&self) -> bool {
+        self.paging() != PagingFigures::default()
+    }
+
+    /// What left the GPU for the disk, and what came back.
+    pub fn paging(&self) -> PagingFigures {
+        self.chunks.figures()
+    }
+
+    /// A checkpoint of this state has been written.
+    pub fn checkpoint_is_written(&mut self) {
+        self.chunks.checkpoint_is_written();
+    }
+
+    /// The map seen from the newest keyframe, if it is compared with it: by its depth or to find its exposure.
+    fn survey(&mut self, has_depth: bool) -> Result<Option<Survey>, MappingError> {
+        let Some(keyframe) = self.keyframes.last() else { return Ok(None) };
         let is_compared = has_depth || (self.config.exposure.enabled && self.is_trained());
         if !is_compared || self.cloud.is_empty() {
             return Ok(None);
@@ -269,7 +309,10 @@ impl Mapper {
         if self.cloud.is_empty() {
             return Ok(KeyframeReport::default());
         }
-        let window = schedule::window(&self.keyframes, &self.config.window);
+        let window = self.complete(schedule::window(&self.keyframes, &self.config.window));
+        if window.is_empty() {
+            return Ok(KeyframeReport::default());
+        }
         let config = self.config.clone();
         let density = &config.density;
         // Where an adapter takes hundreds of steps before the next keyframe, a few more for density control delay nothing.
@@ -278,7 +321,9 @@ impl Mapper {
         let mut scoring = if controlled { self.scoring_steps(&window, density) } else { Vec::new() };
         scoring.truncate(iterations);
         let unscored = iterations - scoring.len();
-        let mut before = schedule::steps(&window, self.keyframes.len(), unscored, &mut self.rng, &config.window);
+        let has_older = self.keyframes.len() > window.len();
+        let older = self.complete(0..if has_older { self.keyframes.len().saturating_sub(config.window.recent) } else { 0 });
+        let mut before = schedule::steps(&window, &older, unscored, &mut self.rng, &config.window);
         let mut after = before.split_off((density.after_share * unscored as f32).round() as usize);
         // Together where they are one batch: the host waits once.
         if !controlled {
@@ -296,7 +341,7 @@ impl Mapper {
             (pruned, grown) = self.timed("density", |mapper| mapper.control_density(scored.1, density))?;
             self.controlled_at = self.step_times.len();
         }
-        let rest = self.with_consolidation(after);
+        let rest = self.with_consolidation(after)?;
         taken += self.take(&rest, &config.adam, interlude)?;
         if config.yields_to_keyframes {
             taken += self.consolidate_until(interlude)?;

@@ -2,6 +2,7 @@
 //! A refinement over all keyframes may follow. Knows nothing of tracking; poses and covisibility arrive with the keyframes.
 
 mod anchors;
+mod chunks;
 mod config;
 mod density;
 mod error;
@@ -18,6 +19,7 @@ mod message;
 mod plane_sweep;
 mod schedule;
 
+pub use chunks::PagingFigures;
 pub use config::{InsertionConfig, MappingConfig, PointsConfig, RefineConfig, WindowConfig};
 pub use density::{ClassicConfig, DensityConfig, DensityStrategy, MultiViewConfig};
 pub use error::MappingError;
@@ -25,7 +27,7 @@ pub use exposure::ExposureConfig;
 pub use host_time::HostTimes;
 pub use keyframe::{DepthSource, Keyframe, RightImage};
 pub use limits::LimitsConfig;
-pub use mapper::{FinalRefinement, Interlude, KeyframeReport, Mapper, MapperState, RefineReport};
+pub use mapper::{FinalRefinement, Interlude, KeyframeReport, Mapper, MapperState, PagedOut, RefineReport};
 pub use message::{InitialMap, MapperMessage, PoseUpdate};
 pub use plane_sweep::PlaneSweepConfig;
 

@@ -38,12 +38,11 @@ pub(super) fn window(keyframes: &[MappedKeyframe], config: &WindowConfig) -> Vec
     window
 }
 
-/// So many steps over the window, newest first, of `len` keyframes; now and then any older one, so that the map does not forget.
-pub(super) fn steps(window: &[usize], len: usize, count: usize, rng: &mut Rng, config: &WindowConfig) -> Vec<Step> {
-    let older = len.saturating_sub(config.recent);
+/// So many steps over the window, newest first; now and then any of the `older` keyframes, so that the map does not forget.
+pub(super) fn steps(window: &[usize], older: &[usize], count: usize, rng: &mut Rng, config: &WindowConfig) -> Vec<Step> {
     let draw = |taken: usize| {
-        let goes_back = len > window.len() && rng.f32() < config.older_share;
-        Step::new(if goes_back { rng.usize(..older.max(1)) } else { window[taken % window.len()] })
+        let goes_back = !older.is_empty() && rng.f32() < config.older_share;
+        Step::new(if goes_back { older[rng.usize(..older.len())] } else { window[taken % window.len()] })
     };
     (0..count).map(draw).collect()
 }

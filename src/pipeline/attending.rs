@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use super::Progress;
 use super::progress::{MappingProgress, RenderOrder};
 use crate::gpu::GpuError;
-use crate::mapping::{Interlude, Mapper, MappingError};
+use crate::mapping::{Interlude, Mapper, MappingError, PagedOut};
 use crate::render::{Rasterizer, Rendered};
 use crate::splat::{GaussianCloud, MapSnapshot, ViewCamera};
 
@@ -52,8 +52,10 @@ pub(super) struct Attending<'a> {
 
 #[derive(Debug, Default)]
 struct State {
-    /// The newest map that was downloaded.
+    /// The newest map that was downloaded: what was on the GPU.
     cloud: Arc<GaussianCloud>,
+    /// What was on the disk then.
+    paged_out: PagedOut,
     /// Whether the map has changed since.
     is_stale: bool,
     snapshots: Share,
@@ -63,17 +65,25 @@ struct State {
 }
 
 impl<'a> Attending<'a> {
-    /// `cloud` is the map so far.
-    pub fn new(progress: &'a Progress, cloud: Arc<GaussianCloud>) -> Self {
+    /// `cloud` is the map so far, but for what is `paged_out`.
+    pub fn new(progress: &'a Progress, cloud: Arc<GaussianCloud>, paged_out: PagedOut) -> Self {
         if !cloud.is_empty() {
             progress.snapshots().put(MapSnapshot { cloud: cloud.clone(), keyframes: 0, psnr_db: 0.0 });
         }
-        Self { progress, state: RefCell::new(State { cloud, ..State::default() }) }
+        Self { progress, state: RefCell::new(State { cloud, paged_out, ..State::default() }) }
     }
 
-    /// The newest map that was downloaded.
-    pub fn cloud(&self) -> Arc<GaussianCloud> {
-        self.state.borrow().cloud.clone()
+    /// The newest map that was downloaded, with what was on the disk then.
+    pub fn cloud(&self, mapper: &Mapper) -> Arc<GaussianCloud> {
+        let State { cloud, paged_out, .. } = &*self.state.borrow();
+        if paged_out.is_nothing() {
+            return cloud.clone();
+        }
+        let mut whole = (**cloud).clone();
+        if let Err(error) = mapper.add_paged_out(&mut whole, paged_out) {
+            tracing::warn!("the map lacks some Gaussians: {error}");
+        }
+        Arc::new(whole)
     }
 
     /// Marks the newest download as out of date.
@@ -146,7 +156,8 @@ impl OrderRenderer {
 
 impl State {
     fn download(&mut self, mapper: &Mapper, progress: &Progress) -> Result<(), MappingError> {
-        self.cloud = Arc::new(self.snapshots.take(|| mapper.download())?);
+        let (cloud, paged_out) = self.snapshots.take(|| mapper.download_resident())?;
+        (self.cloud, self.paged_out) = (Arc::new(cloud), paged_out);
         self.is_stale = false;
         let MappingProgress { keyframes, psnr_db, .. } = self.figures;
         progress.snapshots().put(MapSnapshot { cloud: self.cloud.clone(), keyframes, psnr_db });

@@ -2,6 +2,7 @@
 
 use std::cell::RefCell;
 use std::collections::VecDeque;
+use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -14,7 +15,7 @@ use super::refining::{Checkpoints, KeptMapper, Refining, Round, figures, step_ms
 use super::{PipelineError, Progress};
 use crate::evaluation::machine;
 use crate::gpu::Gpu;
-use crate::mapping::{FinalRefinement, Interlude, KeyframeReport, Mapper, MapperMessage, MappingConfig, MappingError};
+use crate::mapping::{FinalRefinement, Interlude, KeyframeReport, Mapper, MapperMessage, MappingConfig, MappingError, PagedOut, PagingFigures};
 use crate::run_folder::{CheckpointError, Checkpointer, KeyframeRecord, RunState};
 use crate::splat::GaussianCloud;
 
@@ -33,11 +34,20 @@ pub(super) struct MapSummary {
     pub keyframes: Vec<KeyframeRecord>,
     /// Duration of each optimisation step, milliseconds.
     pub step_ms: Vec<f64>,
+    /// What left the adapter for the disk.
+    pub paging: PagingFigures,
     /// Where the refinement may go on.
     pub kept: Option<KeptMapper>,
     /// The thread ended before it reached its checkpoint; there is nothing to write.
     pub behind: bool,
     pub error: Option<PipelineError>,
+}
+
+impl MapSummary {
+    /// Takes in what the mapper has in the end.
+    fn finish(&mut self, mapper: &Mapper, attending: &Attending<'_>) {
+        (self.step_ms, self.cloud, self.paging) = (step_ms(mapper), attending.cloud(mapper), mapper.paging());
+    }
 }
 
 /// Input of the mapping thread.
@@ -49,12 +59,15 @@ pub(super) struct MapThread<'a> {
     /// Real time: frames that wait for the tracker.
     pub frames: Option<&'a Receiver<QueuedFrame>>,
     pub progress: &'a Progress,
+    /// File of Gaussians that leave the GPU; `None` for a temporary one.
+    pub chunks: Option<&'a Path>,
 }
 
 /// The mapper at the start of the thread's work.
 struct Start {
     mapper: Mapper,
-    cloud: Arc<GaussianCloud>,
+    /// What is on the GPU and what is on the disk.
+    map: (GaussianCloud, PagedOut),
     /// State of a final refinement that a resumed run had begun.
     refinement: Option<FinalRefinement>,
     records: Vec<KeyframeRecord>,
@@ -66,13 +79,13 @@ impl MapThread<'_> {
     pub fn map(self, on_round: &mut dyn FnMut(Round<'_>), mut checkpointer: Option<Checkpointer>) -> MapSummary {
         let behind = checkpointer.as_ref().is_some_and(Checkpointer::is_behind);
         let start = guarded("mapping", || self.start(checkpointer.as_mut()));
-        let Start { mut mapper, cloud, refinement, records } = match start {
+        let Start { mut mapper, map: (cloud, paged_out), refinement, records } = match start {
             Ok(start) => start,
             Err(error) => return MapSummary { behind, error: Some(error), ..MapSummary::default() },
         };
         let mut summary = MapSummary { keyframes: records, ..MapSummary::default() };
         let mut checkpoints = Checkpoints::new(checkpointer);
-        let attending = Attending::new(self.progress, cloud);
+        let attending = Attending::new(self.progress, Arc::new(cloud), paged_out);
         let mapped = self.map_messages(&mut mapper, &mut summary, &attending, &mut checkpoints);
         summary.error = mapped.err();
         // Also after an error: a device that still answers gives all that was mapped.
@@ -83,7 +96,7 @@ impl MapThread<'_> {
         }
         if summary.error.is_none() {
             let refined = self.refine(&mut mapper, &mut summary.keyframes, refinement, &attending, &mut checkpoints, on_round);
-            (summary.step_ms, summary.cloud) = (step_ms(&mapper), attending.cloud());
+            summary.finish(&mapper, &attending);
             match refined {
                 Ok(refinement) if self.progress.control().keeps_mapper() => {
                     summary.kept = Some(KeptMapper {
@@ -98,7 +111,7 @@ impl MapThread<'_> {
             }
             return summary;
         }
-        (summary.step_ms, summary.cloud) = (step_ms(&mapper), attending.cloud());
+        summary.finish(&mapper, &attending);
         summary
     }
 
@@ -127,13 +140,14 @@ impl MapThread<'_> {
 
     /// A new mapper and an empty map, or those of a checkpoint.
     fn start(&self, checkpointer: Option<&mut Checkpointer>) -> Result<Start, PipelineError> {
+        let has_checkpoints = checkpointer.is_some();
         if let Some(checkpointer) = checkpointer
             && let Some(state) = checkpointer.take_state()
         {
             return self.catch_up(checkpointer, state);
         }
-        let mapper = Mapper::new(self.gpu.clone(), self.config)?;
-        Ok(Start { mapper, cloud: Arc::default(), refinement: None, records: Vec::new() })
+        let mapper = Mapper::new(self.gpu.clone(), self.config)?.with_chunks(self.chunks.map(Path::to_owned), has_checkpoints);
+        Ok(Start { mapper, map: Default::default(), refinement: None, records: Vec::new() })
     }
 
     /// Replays the messages up to a checkpoint: uploads keyframe images.
@@ -148,7 +162,8 @@ impl MapThread<'_> {
             MappingError::NotTheSame { .. } => not_repeated(),
             error => error.into(),
         };
-        let mut mapper = Mapper::restore(self.gpu.clone(), self.config, &state.mapper).map_err(explained)?;
+        let chunks = self.chunks.map(Path::to_owned);
+        let mut mapper = Mapper::restore(self.gpu.clone(), self.config, &state.mapper, chunks).map_err(explained)?;
         let records = state.records();
         while checkpointer.digest().messages < state.digest.messages {
             if self.progress.control().is_leaving() {
@@ -164,8 +179,8 @@ impl MapThread<'_> {
             return Err(not_repeated());
         }
         tracing::info!(keyframes = records.len(), gaussians = mapper.gaussians(), "checkpoint reached");
-        let cloud = Arc::new(mapper.download()?);
-        Ok(Start { mapper, cloud, refinement: state.mapper.into_refinement(), records })
+        let map = mapper.download_resident()?;
+        Ok(Start { mapper, map, refinement: state.mapper.into_refinement(), records })
     }
 
     fn map_messages(

@@ -8,7 +8,7 @@ use super::attending::{Attending, OrderRenderer};
 use super::progress::{MappingProgress, guarded};
 use super::run::writable;
 use super::{Control, PipelineError, Progress};
-use crate::mapping::{FinalRefinement, KeyframeId, Mapper, MapperMessage};
+use crate::mapping::{FinalRefinement, KeyframeId, Mapper, MapperMessage, PagedOut};
 use crate::run_folder::{Checkpointer, KeyframeRecord, RunResult};
 use crate::splat::{Exposure, GaussianCloud};
 
@@ -24,7 +24,7 @@ impl Round<'_> {
     /// The map; `None` where the device fails, which the next step reports.
     pub fn cloud(&mut self) -> Option<Arc<GaussianCloud>> {
         self.attending.download(self.mapper).ok()?;
-        Some(self.attending.cloud())
+        Some(self.attending.cloud(self.mapper))
     }
 }
 
@@ -121,7 +121,7 @@ impl KeptMapper {
     /// If the device fails or a step is not finite; the result has the map before that.
     pub fn refine_on(&mut self, result: &mut RunResult, progress: &Progress) -> Result<(), PipelineError> {
         let started = Instant::now();
-        let attending = Attending::new(progress, result.cloud.clone());
+        let attending = Attending::new(progress, result.cloud.clone(), PagedOut::default());
         let refining = Refining {
             mapper: &mut self.mapper,
             refinement: &mut self.refinement,
@@ -131,7 +131,7 @@ impl KeptMapper {
             extra_steps: self.extra_steps,
         };
         let refined = refining.refine(&mut Checkpoints::none(), &mut |_| ());
-        result.cloud = writable(attending.cloud());
+        result.cloud = writable(attending.cloud(&self.mapper));
         result.step_ms = step_ms(&self.mapper);
         result.wall_s += started.elapsed().as_secs_f64();
         refined
@@ -162,7 +162,7 @@ impl Checkpoints {
     /// A keyframe or a round is over. A run that leaves stops here.
     pub fn finished_one(
         &mut self,
-        mapper: &Mapper,
+        mapper: &mut Mapper,
         refinement: Option<&FinalRefinement>,
         records: &[KeyframeRecord],
         control: &Control,
@@ -178,7 +178,10 @@ impl Checkpoints {
         let began = Instant::now();
         match guarded("mapping", || Ok(checkpointer.finished_one(mapper, refinement, records)?)) {
             Ok(None) => {}
-            Ok(Some(bytes)) => tracing::debug!(bytes, ms = began.elapsed().as_secs_f64() * 1e3, "checkpoint written"),
+            Ok(Some(bytes)) => {
+                mapper.checkpoint_is_written();
+                tracing::debug!(bytes, ms = began.elapsed().as_secs_f64() * 1e3, "checkpoint written");
+            }
             Err(error) if !self.failed => {
                 self.failed = true;
                 tracing::warn!("{error}; the run goes on, and the checkpoint before this one stays");

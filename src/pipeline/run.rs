@@ -1,5 +1,6 @@
 //! Starts the threads of a run, joins them, and gathers their results.
 
+use std::path::Path;
 use std::sync::Arc;
 use std::thread::{Builder, ScopedJoinHandle};
 use std::time::Instant;
@@ -37,7 +38,8 @@ pub struct Replay {
     pub stopped: bool,
 }
 
-/// Replays a recording, from a checkpoint on if there is one. Errors that end it early are returned beside the partial result.
+/// Replays a recording, from a checkpoint on if there is one. Errors that end it early are returned beside the partial result. Gaussians that leave
+/// the GPU go to the file `chunks`, or to a temporary one.
 ///
 /// # Errors
 /// If there is no result at all: a thread cannot be started, or the run does not reach its checkpoint.
@@ -46,6 +48,7 @@ pub fn run(
     gpu: &Arc<Gpu>,
     progress: &Progress,
     checkpointer: Option<Checkpointer>,
+    chunks: Option<&Path>,
 ) -> Result<Replay, PipelineError> {
     let started = Instant::now();
     let mut elapsed = checkpointer.as_ref().map_or_else(Elapsed::default, Checkpointer::earlier);
@@ -63,7 +66,8 @@ pub fn run(
             .name("mapping".into())
             .spawn_scoped(scope, move || {
                 let (messages, frames) = (&messages, waiting.as_ref());
-                let map = MapThread { gpu, config: mapping, messages, frames, progress }.map(&mut |_| (), checkpointer);
+                let thread = MapThread { gpu, config: mapping, messages, frames, progress, chunks };
+                let map = thread.map(&mut |_| (), checkpointer);
                 if map.error.is_some() {
                     // The others see that the channel is closed once nothing holds them.
                     progress.control().resume();
@@ -140,6 +144,7 @@ fn gather(
         keyframes_deferred: track.deferred,
         depth_bias: track.depth_bias,
         step_ms: map.step_ms,
+        paging: map.paging,
         wall_s,
         resumed,
     };

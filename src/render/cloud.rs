@@ -2,16 +2,18 @@
 
 mod change;
 mod motion;
+mod part;
 
 use bytemuck::{Pod, Zeroable};
 use glam::{Quat, Vec3};
 use serde::{Deserialize, Serialize};
 
 pub use motion::RunMotion;
+pub use part::CloudPart;
 
 use self::change::Kernels;
 use super::layout::GEOMETRY_PLANES;
-use crate::gpu::{Gpu, GpuBuffer, GpuError, Part, Uniforms, plain};
+use crate::gpu::{Gpu, GpuBuffer, GpuError, Part, Uniforms};
 use crate::splat::{GaussianCloud, ShDegree};
 
 /// Parameters, first and second moments, averages.
@@ -73,12 +75,7 @@ pub struct CloudState {
     limit: Option<usize>,
     room: Option<usize>,
     rounds: u32,
-    /// `[BUFFERS, planes, N]`: parameters, first and second moments, averages.
-    #[serde(with = "plain")]
-    values: Vec<[f32; 4]>,
-    /// `[N]`
-    #[serde(with = "plain")]
-    histories: Vec<GaussianHistory>,
+    all: CloudPart,
 }
 
 impl GpuCloud {
@@ -141,6 +138,11 @@ impl GpuCloud {
         self.count == 0
     }
 
+    /// Forgets all Gaussians; the buffers stay.
+    pub(super) fn clear(&mut self) {
+        (self.count, self.frozen) = (0, 0);
+    }
+
     /// The first `count` Gaussians are rendered, but no step moves them from now on; whoever makes a plan must keep to it.
     pub fn freeze(&mut self, count: usize) {
         self.frozen = count;
@@ -163,7 +165,12 @@ impl GpuCloud {
 
     /// Bytes that there is to be room for with each Gaussian: parameters, two moments, averages, history, and spares for changes.
     pub fn bytes_each(&self) -> u64 {
-        ((BUFFERS + 1) * self.planes() * 16 + 2 * size_of::<GaussianHistory>()) as u64
+        Self::bytes_for_each(self.sh_degree)
+    }
+
+    /// The same for a degree.
+    pub fn bytes_for_each(sh_degree: ShDegree) -> u64 {
+        ((BUFFERS + 1) * planes(sh_degree) * 16 + 2 * size_of::<GaussianHistory>()) as u64
     }
 
     /// Bytes that it has at present.
@@ -285,13 +292,7 @@ impl GpuCloud {
     /// # Errors
     /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn download(&self, gpu: &Gpu) -> Result<GaussianCloud, GpuError> {
-        let planes = self.planes_of(gpu, &self.averages)?;
-        let mut cloud = cloud_from_planes(self.sh_degree, &planes);
-        if self.antialiased {
-            cloud.antialiased = true;
-            cloud.smooth(planes[1].iter().map(|scale| scale[3]));
-        }
-        Ok(cloud)
+        Ok(part::shown(self.sh_degree, self.antialiased, &self.planes_of(gpu, &self.averages)?))
     }
 
     /// All that training needs to go on as if it had never stopped.
@@ -299,13 +300,13 @@ impl GpuCloud {
     /// # Errors
     /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn state(&self, gpu: &Gpu) -> Result<CloudState, GpuError> {
-        let mut values = Vec::with_capacity(BUFFERS * self.planes() * self.count);
+        let mut all = CloudPart::with_capacity(self.planes(), self.count);
         for buffer in self.buffers() {
-            let read = gpu.read(None, &self.parts(buffer).collect::<Vec<_>>())?;
-            (0..self.planes()).for_each(|plane| values.extend(read.part::<[f32; 4]>(plane)));
+            all.read_planes(gpu, self.parts(buffer))?;
         }
+        all.histories = self.histories.read(gpu, 0, self.count)?;
         let Self { capacity, frozen, limit, room, rounds, .. } = *self;
-        Ok(CloudState { capacity, frozen, limit, room, rounds, values, histories: self.histories.read(gpu, 0, self.count)? })
+        Ok(CloudState { capacity, frozen, limit, room, rounds, all })
     }
 
     /// The map of a state, to the bit; `None` if that is no map of this degree.
@@ -313,22 +314,14 @@ impl GpuCloud {
     /// # Errors
     /// [`GpuError`] if a buffer does not fit or the device fails.
     pub fn restore(gpu: &Gpu, sh_degree: ShDegree, state: &CloudState) -> Result<Option<Self>, GpuError> {
-        let planes = planes(sh_degree);
-        let count = state.values.len() / (BUFFERS * planes);
-        if state.values.len() != BUFFERS * planes * count
-            || state.capacity < count.max(state.frozen)
-            || state.histories.len() != count
-        {
+        let count = state.all.len();
+        if !state.all.is_whole(sh_degree) || state.capacity < count.max(state.frozen) {
             return Ok(None);
         }
         let mut cloud = Self::new(gpu, sh_degree, state.capacity)?;
         (cloud.count, cloud.frozen, cloud.limit, cloud.room, cloud.rounds) =
             (count, state.frozen, state.limit, state.room, state.rounds);
-        cloud.histories.write(gpu, 0, &state.histories);
-        let buffers = cloud.buffers();
-        for (i, plane) in state.values.chunks_exact(count.max(1)).enumerate() {
-            buffers[i / planes].write(gpu, (i % planes) * cloud.capacity, plane);
-        }
+        cloud.write(gpu, 0, &state.all);
         Ok(Some(cloud))
     }
 }

@@ -7,13 +7,15 @@ mod plan;
 mod rasterizer;
 mod rendered;
 pub(crate) mod shaders;
+mod slabs;
 mod sort;
 mod workspace;
 
-pub use cloud::{CloudState, GaussianHistory, GpuCloud, RunMotion};
+pub use cloud::{CloudPart, CloudState, GaussianHistory, GpuCloud, RunMotion};
 pub use layout::{BlendForm, Blending};
 pub use plan::{Division, Plan};
 pub use rasterizer::{PreparedView, Rasterizer, ViewCounts};
 pub use rendered::Rendered;
 pub use shaders::{SHADERS, ShaderSource};
+pub use slabs::MapRenderer;
 pub use workspace::Capacities;

@@ -27,6 +27,21 @@ impl Rendered {
         1.0 - self.transmittance[i]
     }
 
+    /// What lies wholly behind becomes part of the picture.
+    pub(super) fn blend_over(&mut self, behind: &Self) {
+        for (i, front) in self.surface.iter_mut().enumerate() {
+            let (light, [slope_x, slope_y, square, median]) = (self.transmittance[i], behind.surface[i]);
+            let is_median = light >= 0.5 && light * behind.transmittance[i] < 0.5;
+            let median = if is_median { median } else { front[3] };
+            *front = [front[0] + light * slope_x, front[1] + light * slope_y, front[2] + light * square, median];
+        }
+        let pixels = self.color_depth.iter_mut().zip(&mut self.transmittance);
+        for ((front, light), (color_depth, beyond)) in pixels.zip(behind.color_depth.iter().zip(&behind.transmittance)) {
+            front.iter_mut().zip(color_depth).for_each(|(front, value)| *front += *light * value);
+            *light *= beyond;
+        }
+    }
+
     /// Becomes what a camera of this exposure records of it.
     pub fn expose(&mut self, exposure: &Exposure) {
         let [r, g, b] = exposure.gains().to_array();

@@ -9,7 +9,7 @@ use serde::Serialize;
 
 use super::{FolderLock, RunResult};
 use crate::evaluation::metrics::{
-    Adapter, AteFigures, DepthBiasFigures, ImageProtocols, MappingFigures, Metrics, RpeFigures, Times, UsualTimes,
+    Adapter, AteFigures, DepthBiasFigures, ImageProtocols, MappingFigures, Metrics, PagingFigures, RpeFigures, Times, UsualTimes,
 };
 use crate::evaluation::views::{ComparedView, ViewSelection, ViewSource, evaluate_views};
 use crate::evaluation::{
@@ -19,6 +19,7 @@ use crate::export::{ExportError, MapFormat};
 use crate::files::{WriteError, remove_partials, write_atomically};
 use crate::geometry::{Se3, Trajectory};
 use crate::gpu::{Gpu, GpuError};
+use crate::mapping;
 use crate::recording::Recording;
 use crate::splat::GaussianCloud;
 use crate::tracking::DepthBias;
@@ -43,6 +44,8 @@ pub const COMPARISON: &str = "comparison.json";
 pub const EXPOSURES: &str = "exposures.json";
 /// State to resume from; absent after the run's end.
 pub const CHECKPOINT: &str = "checkpoint.bin";
+/// Gaussians that have left the GPU; absent after the run's end.
+pub const CHUNKS: &str = "chunks.bin";
 
 /// At most this many held-out views are kept as pictures, spread evenly.
 const MAX_PICTURES: usize = 100;
@@ -256,7 +259,14 @@ pub fn evaluate(
         is_held_out: &is_held_out,
         exposures: &input.exposures,
     };
-    let source = ViewSource { sequence, map_scale: config.map_scale, gpu, cloud: input.cloud, surface: config.mapping.surface };
+    let source = ViewSource {
+        sequence,
+        map_scale: config.map_scale,
+        gpu,
+        cloud: input.cloud,
+        most_gaussians: config.mapping.limits.most_rendered(gpu.bytes(), input.cloud.sh_degree),
+        surface: config.mapping.surface,
+    };
     let (images, views) = evaluate_views(source, &selection, &|view| pictures.add(view), on_view)?;
     comparison.views = views;
     pictures.finish()?;
@@ -371,6 +381,7 @@ pub fn write_metrics(
             ms_per_iteration: UsualTimes::of(&result.step_ms),
             map_width: pinhole.width,
             map_height: pinhole.height,
+            paging: (result.paging != mapping::PagingFigures::default()).then(|| paging(&result.paging)),
         }),
         peak_host_bytes: machine::peak_host_bytes(),
         peak_gpu_bytes: Some(gpu.peak_bytes()),
@@ -382,6 +393,11 @@ pub fn write_metrics(
     };
     write_json(&metrics, &out.join(METRICS))?;
     Ok(metrics)
+}
+
+fn paging(figures: &mapping::PagingFigures) -> PagingFigures {
+    let mapping::PagingFigures { gaussians_out, gaussians_in, most_away } = *figures;
+    PagingFigures { gaussians_out, gaussians_in, most_away }
 }
 
 /// The adapter as metrics name it.

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use super::history::{History, KeyframeRecord};
 use crate::evaluation::{ExposureRecord, Exposures};
 use crate::geometry::{Se3, StampedPose, Trajectory};
+use crate::mapping::PagingFigures;
 use crate::splat::GaussianCloud;
 use crate::tracking::{DepthBias, KeyframePose};
 
@@ -34,6 +35,8 @@ pub struct RunResult {
     pub tracking_ms: Vec<f64>,
     /// Duration of each optimisation step, milliseconds.
     pub step_ms: Vec<f64>,
+    /// What left the adapter for the disk.
+    pub paging: PagingFigures,
     /// Wall-clock time, seconds; of all processes of a resumed run, up to their checkpoints.
     pub wall_s: f64,
     /// Number of resumptions from a checkpoint.

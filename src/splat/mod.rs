@@ -101,6 +101,32 @@ impl GaussianCloud {
         self.sh.extend(gaussian.sh.into_iter().chain(zeros).take(self.sh_degree.coefficients()));
     }
 
+    /// Appends all Gaussians of another map.
+    ///
+    /// # Panics
+    /// If it has another degree.
+    pub fn append(&mut self, other: &Self) {
+        assert_eq!(self.sh_degree, other.sh_degree, "a map has one spherical-harmonics degree");
+        self.means.extend_from_slice(&other.means);
+        self.log_scales.extend_from_slice(&other.log_scales);
+        self.rotations.extend_from_slice(&other.rotations);
+        self.raw_opacities.extend_from_slice(&other.raw_opacities);
+        self.sh.extend_from_slice(&other.sh);
+    }
+
+    /// Some of its Gaussians, in the given order.
+    pub fn picked(&self, which: impl Iterator<Item = usize> + Clone) -> Self {
+        let k = self.sh_degree.coefficients();
+        Self {
+            means: which.clone().map(|i| self.means[i]).collect(),
+            log_scales: which.clone().map(|i| self.log_scales[i]).collect(),
+            rotations: which.clone().map(|i| self.rotations[i]).collect(),
+            raw_opacities: which.clone().map(|i| self.raw_opacities[i]).collect(),
+            sh: which.flat_map(|i| self.sh[i * k..(i + 1) * k].iter().copied()).collect(),
+            ..self.emptied()
+        }
+    }
+
     /// A copy of Gaussian `i`.
     pub fn get(&self, i: usize) -> Gaussian {
         let k = self.sh_degree.coefficients();

@@ -23,6 +23,7 @@ impl Mapper {
         }
         let moved = self.anchors.moved(&motions);
         self.cloud.transform(&self.gpu, &moved)?;
+        self.chunks.transform(&motions);
         Ok(moved.iter().map(|motion| motion.run.len()).sum())
     }
 
@@ -33,8 +34,8 @@ impl Mapper {
     pub fn remove_keyframes(&mut self, keyframes: &[KeyframeId]) -> Result<usize, MappingError> {
         let keyframes: BTreeSet<KeyframeId> = keyframes.iter().copied().collect();
         let removed = self.anchors.of(&keyframes);
-        let gaussians = removed.len();
-        if gaussians > 0 {
+        let gaussians = removed.len() + self.chunks.remove(&keyframes, self.config.sh_degree)?;
+        if !removed.is_empty() {
             self.change(&Plan::removing(removed))?;
         }
         self.keyframes.retain(|keyframe| !keyframes.contains(&keyframe.id));

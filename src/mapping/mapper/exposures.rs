@@ -12,9 +12,9 @@ impl Mapper {
         self.keyframes.iter().map(|keyframe| (keyframe.id, keyframe.exposure))
     }
 
-    /// The exposure of an image of which the map shows what was surveyed. A map that no step has moved yet shows nothing that counts.
+    /// The exposure of the newest keyframe's image, of which the map shows what was surveyed. A map that no step has moved yet shows nothing that counts.
     pub(super) fn exposure(&self, image: &RectifiedImage, survey: Option<&Survey>) -> Exposure {
-        let (config, last) = (&self.config.exposure, self.keyframes.last().map_or(Exposure::default(), |k| k.exposure));
+        let (config, last) = (&self.config.exposure, self.keyframes.iter().nth_back(1).map_or(Exposure::default(), |k| k.exposure));
         let shown = survey.filter(|_| config.enabled && self.is_trained());
         shown.map_or(last, |shown| exposure::measure(exposure::recorded(image), &shown.samples, &last, config))
     }
@@ -23,7 +23,7 @@ impl Mapper {
     pub(super) fn refine_exposures(&mut self, refinement: &mut FinalRefinement) -> Result<(), MappingError> {
         let ExposureConfig { enabled, refinements, .. } = self.config.exposure;
         let due = (refinement.exposed + 1) as f32 / (2 * refinements.max(1)) as f32;
-        if !enabled || refinement.exposed >= refinements || refinement.progress() < due {
+        if !enabled || refinement.exposed >= refinements || refinement.progress() < due || !self.chunks.are_here() {
             return Ok(());
         }
         refinement.exposed += 1;

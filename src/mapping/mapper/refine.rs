@@ -78,6 +78,11 @@ impl FinalRefinement {
         Ok(flow)
     }
 
+    /// Nothing is left to learn from.
+    fn end_here(&mut self) {
+        (self.config.seconds, self.config.steps, self.more) = (None, self.done, 0);
+    }
+
     /// Goes on beyond its end for so many steps, at the last rates and without density control.
     pub fn extend(&mut self, steps: usize) {
         self.more += steps;
@@ -99,11 +104,11 @@ impl FinalRefinement {
 
 impl Mapper {
     /// Steps, and the online steps of the running epoch that follow them.
-    pub(super) fn with_consolidation(&mut self, mut steps: Vec<Step>) -> Vec<Step> {
+    pub(super) fn with_consolidation(&mut self, mut steps: Vec<Step>) -> Result<Vec<Step>, MappingError> {
         if !self.config.yields_to_keyframes {
-            steps.extend(self.draw(self.config.refine.steps_per_keyframe, false));
+            steps.extend(self.draw(self.config.refine.steps_per_keyframe, false)?);
         }
-        steps
+        Ok(steps)
     }
 
     /// Takes steps of the running epoch until `interlude` ends them.
@@ -114,22 +119,36 @@ impl Mapper {
         let config = self.config.clone();
         let mut taken = Taken::default();
         while !self.cloud.is_empty() && interlude.between(self)?.is_continue() {
-            let batch = self.draw(self.batch(), false);
+            let batch = self.draw(self.batch(), false)?;
             taken += self.steps(&batch, &config.adam, None)?.0;
         }
         Ok(taken)
     }
 
     /// So many steps of the running epoch.
-    fn draw(&mut self, count: usize, coarse: bool) -> Vec<Step> {
-        let mut next = || {
+    fn draw(&mut self, count: usize, coarse: bool) -> Result<Vec<Step>, MappingError> {
+        let mut steps = Vec::with_capacity(count);
+        while steps.len() < count {
             if self.epoch.is_empty() {
-                self.epoch = self.views();
-                self.rng.shuffle(&mut self.epoch);
+                self.epoch = self.next_epoch()?;
             }
-            self.epoch.pop()
-        };
-        (0..count).filter_map(|_| next()).map(|keyframe| Step { coarse, ..Step::new(keyframe) }).collect()
+            let Some(keyframe) = self.epoch.pop() else { break };
+            // Chunks may have left since the epoch began.
+            if self.is_complete(keyframe) {
+                steps.push(Step { coarse, ..Step::new(keyframe) });
+            }
+        }
+        Ok(steps)
+    }
+
+    /// Keyframes in the order in which steps learn from them, the last first.
+    fn next_epoch(&mut self) -> Result<Vec<usize>, MappingError> {
+        if !self.visits.is_empty() && !self.chunks.are_here() {
+            return self.next_stay();
+        }
+        let mut epoch = self.complete(self.views());
+        self.rng.shuffle(&mut epoch);
+        Ok(epoch)
     }
 
     /// Lets each step leave out a share of the Gaussians, others each time.
@@ -156,6 +175,7 @@ impl Mapper {
         };
         let started = config.seconds.map(|_| Instant::now());
         self.epoch.clear();
+        self.visits = vec![0; self.keyframes.len()];
         let mut warm_up = 0;
         if self.has_initial_map {
             // It has the detail that steps at half size would take from it.
@@ -187,7 +207,11 @@ impl Mapper {
         let end = refinement.done + density_every.min(left);
         while refinement.done < end && !refinement.is_done() && refinement.interlude(self, interlude)?.is_continue() {
             let coarse = refinement.progress() < half_size_share;
-            let mut batch = self.draw(BATCH.min(end - refinement.done), coarse);
+            let mut batch = self.draw(BATCH.min(end - refinement.done), coarse)?;
+            if batch.is_empty() {
+                refinement.end_here();
+                break;
+            }
             self.drop_out(&mut batch, refinement.config.dropout * refinement.progress());
             batch.iter_mut().for_each(|step| step.surface_share = refinement.progress());
             adam = refinement.rates();
@@ -200,7 +224,7 @@ impl Mapper {
         self.refine_exposures(refinement)?;
         let is_controlled = refinement.progress() < LAST_CONTROL;
         let (pruned, grown) = if is_controlled { self.score_and_control(refinement, &density, &adam)? } else { (0, 0) };
-        let (gaussians, psnr_db) = (self.cloud.len(), taken.psnr_db());
+        let (gaussians, psnr_db) = (self.gaussians(), taken.psnr_db());
         Ok(Some(RefineReport { steps_done: refinement.done, pruned, grown, gaussians, psnr_db }))
     }
 
@@ -211,9 +235,9 @@ impl Mapper {
         density: &DensityConfig,
         adam: &AdamConfig,
     ) -> Result<(usize, usize), MappingError> {
-        let mut views = self.views();
+        let mut views = self.complete(self.views());
         let count = views.len();
-        views.rotate_left(refinement.rounds % count);
+        views.rotate_left(refinement.rounds % count.max(1));
         refinement.rounds += 1;
         let steps = self.scoring_steps(&views, density);
         self.trainer.begin_scores(&self.cloud)?;

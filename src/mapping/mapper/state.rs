@@ -1,5 +1,6 @@
 //! A mapper's state, to go on elsewhere to the bit. The keyframes' images are left out: they come again with the recording.
 
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -9,6 +10,7 @@ use serde::{Deserialize, Serialize};
 use super::{FinalRefinement, Mapper};
 use crate::gpu::Gpu;
 use crate::mapping::anchors::Anchors;
+use crate::mapping::chunks::{Chunks, ChunksState};
 use crate::mapping::keyframe::{KeyframeState, MappedKeyframe};
 use crate::mapping::{Keyframe, MappingConfig, MappingError};
 use crate::optimise::TrainerState;
@@ -20,6 +22,8 @@ pub struct MapperState {
     cloud: CloudState,
     trainer: TrainerState,
     anchors: Anchors,
+    chunks: ChunksState,
+    visits: Vec<u32>,
     keyframes: Vec<KeyframeState>,
     rng: u64,
     step_times: Vec<Duration>,
@@ -39,6 +43,8 @@ impl Mapper {
             cloud: self.cloud.state(&self.gpu)?,
             trainer: self.trainer.state(),
             anchors: self.anchors.clone(),
+            chunks: self.chunks.state()?,
+            visits: self.visits.clone(),
             keyframes: self.keyframes.iter().map(|keyframe| keyframe.state(&self.gpu, &self.images)).collect::<Result<_, _>>()?,
             rng: self.rng.get_seed(),
             step_times: self.step_times.clone(),
@@ -48,12 +54,18 @@ impl Mapper {
         })
     }
 
-    /// The mapper of a state, without its keyframes: see [`Self::insert_again`].
+    /// The mapper of a state, without its keyframes: see [`Self::insert_again`]. `chunks` is the file of what was not on the GPU.
     ///
     /// # Errors
     /// [`MappingError`] if a buffer does not fit or the device fails.
-    pub fn restore(gpu: Arc<Gpu>, config: &MappingConfig, state: &MapperState) -> Result<Self, MappingError> {
+    pub fn restore(
+        gpu: Arc<Gpu>,
+        config: &MappingConfig,
+        state: &MapperState,
+        chunks: Option<PathBuf>,
+    ) -> Result<Self, MappingError> {
         let mut mapper = Self::new(gpu, config)?;
+        mapper.chunks = Chunks::restore(chunks, &state.chunks)?;
         let cloud = GpuCloud::restore(&mapper.gpu, config.sh_degree, &state.cloud)?.ok_or(MappingError::State)?;
         mapper.cloud = cloud.with_antialiasing(config.antialiased);
         if state.anchors.len() != mapper.cloud.len() {
@@ -65,6 +77,7 @@ impl Mapper {
             mapper.density.reserve(&mapper.gpu, state.trainer.scored() as u32)?;
         }
         mapper.anchors = state.anchors.clone();
+        mapper.visits = state.visits.clone();
         mapper.rng = Rng::with_seed(state.rng);
         mapper.step_times = state.step_times.clone();
         mapper.epoch = state.epoch.clone();

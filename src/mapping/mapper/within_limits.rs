@@ -49,6 +49,7 @@ impl Mapper {
             self.cloud.limit(self.most_gaussians());
         }
         if self.probe(self.cloud.len() + new.len()) || limited {
+            self.make_room(new.len())?;
             let most = self.most_gaussians();
             new = new.thinned(limits::insertions_allowed(new.len(), most));
             self.remove_least(self.cloud.len().saturating_sub(most - new.len()))?;
@@ -78,11 +79,16 @@ impl Mapper {
         Ok(())
     }
 
-    /// How many Gaussians there may be, at present, when there is to be room for one more keyframe's image.
+    /// How many Gaussians there may be on the GPU, at present.
     pub(super) fn most_gaussians(&self) -> usize {
+        self.config.limits.gaussians(self.chunks.gaussians_away()).min(self.most_on_gpu())
+    }
+
+    /// How many of them its memory has room for, when there is to be room for one more keyframe's image.
+    pub(super) fn most_on_gpu(&self) -> usize {
         let other =
             LimitsConfig::other_bytes(self.gpu.bytes() + self.largest_image_bytes(), self.cloud.bytes(), self.cloud.capacity());
-        self.config.limits.gaussians(self.cloud.bytes_each(), other).min(self.cloud.most(&self.gpu))
+        self.config.limits.gaussians_on_gpu(self.cloud.bytes_each(), other).min(self.cloud.most(&self.gpu))
     }
 
     /// Bytes on the GPU of the largest keyframe's image.
@@ -102,8 +108,7 @@ impl Mapper {
         let full = wanted > most;
         if full && !self.is_full {
             tracing::warn!(
-                "the adapter has room for {most} Gaussians; the map goes on within it, and those of least contribution go first. \
-                 --max-gaussians or --max-gpu-memory bounds the map before that"
+                "the adapter has room for {most} Gaussians; those that no keyframe of the window sees go to the disk"
             );
         }
         self.is_full |= full;

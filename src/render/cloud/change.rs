@@ -3,7 +3,7 @@
 use glam::Vec3;
 
 use super::{GEOMETRY_PLANES, GpuCloud, allocate, allocate_histories, planes};
-use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, workgroups};
+use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, UniformCell, Uniforms, workgroups};
 use crate::render::layout::{AppendSetup, BlendForm, DivideSetup, GatherSetup};
 use crate::render::plan::Plan;
 use crate::render::shaders::{self, ShaderSource};
@@ -23,6 +23,50 @@ impl Kernels {
     }
 }
 
+/// A change that is ready to be made, one buffer after the other.
+pub(super) struct Gathering {
+    /// Those that go, and the parents of those that come.
+    changes: GpuBuffer,
+    kept: u32,
+    children: u32,
+    setup: UniformCell,
+    of_children: UniformCell,
+}
+
+impl Gathering {
+    /// Of a map with `count` Gaussians in buffers for `capacity_in`, into such for `capacity_out`.
+    pub fn new(gpu: &Gpu, plan: &Plan, cloud: &mut GpuCloud, capacity_out: usize) -> Result<Self, GpuError> {
+        let list = plan.changes();
+        let changes = GpuBuffer::storage(gpu, "changes", (list.len() * 4) as u64)?;
+        changes.write(gpu, 0, &list);
+        let (kept, children) = (plan.kept(cloud.count) as u32, 2 * plan.divided.len() as u32);
+        let removed = plan.removed.len() as u32;
+        let (capacity_in, capacity_out) = (cloud.capacity as u32, capacity_out as u32);
+        let round = cloud.rounds as f32;
+        let uniforms = &mut cloud.uniforms;
+        uniforms.begin();
+        let setup = uniforms.put(&GatherSetup { kept, children, removed, capacity_in, capacity_out, pad: [0; 3] });
+        let of_children =
+            uniforms.put(&DivideSetup { first: kept, children, parents: removed, capacity: capacity_out, round, pad: [0; 3] });
+        uniforms.upload(gpu);
+        Ok(Self { changes, kept, children, setup, of_children })
+    }
+
+    /// Gathers one buffer into another.
+    pub fn gather(&self, gpu: &Gpu, (kernels, uniforms): (&Kernels, &Uniforms), from: &GpuBuffer, to: &GpuBuffer) {
+        let bindings = [(0, uniforms.of(self.setup)), (1, &self.changes), (2, from), (3, to)];
+        dispatch(gpu, &kernels.gather, &bindings, self.kept + self.children);
+    }
+}
+
+fn dispatch(gpu: &Gpu, kernel: &Kernel, bindings: &[(u32, &GpuBuffer)], threads: u32) {
+    let mut encoder = gpu.device.create_command_encoder(&Default::default());
+    let mut pass = encoder.begin_compute_pass(&Default::default());
+    kernel.dispatch(gpu, &mut pass, bindings, workgroups(threads.div_ceil(256)));
+    drop(pass);
+    gpu.submit(encoder);
+}
+
 impl GpuCloud {
     /// Appends Gaussians with zero moments and without a history. Those that hold a NaN or an infinity are left out; their number is
     /// returned.
@@ -36,10 +80,7 @@ impl GpuCloud {
         if finite.is_empty() {
             return Ok(left_out);
         }
-        let capacity = self.capacity_for(gpu, self.count + finite.len());
-        if capacity > self.capacity {
-            self.rebuild(gpu, &Plan::default(), capacity)?;
-        }
+        self.reserve(gpu, self.count + finite.len())?;
         let value = |plane: usize| finite.iter().map(move |&i| plane_value(cloud, plane, i));
         let values: Vec<[f32; 4]> = (0..self.planes()).flat_map(value).collect();
         let appended = GpuBuffer::storage(gpu, "appended", (values.len() * 16) as u64)?;
@@ -61,14 +102,16 @@ impl GpuCloud {
             (5, &self.averages),
             (6, &self.histories),
         ];
-        let mut encoder = gpu.device.create_command_encoder(&Default::default());
-        let mut pass = encoder.begin_compute_pass(&Default::default());
-        self.kernels.append.dispatch(gpu, &mut pass, &bindings, workgroups((finite.len() as u32).div_ceil(256)));
-        drop(pass);
         self.uniforms.upload(gpu);
-        gpu.submit(encoder);
+        dispatch(gpu, &self.kernels.append, &bindings, finite.len() as u32);
         self.count += finite.len();
         Ok(left_out)
+    }
+
+    /// Makes room for so many Gaussians.
+    pub(super) fn reserve(&mut self, gpu: &Gpu, needed: usize) -> Result<(), GpuError> {
+        let capacity = self.capacity_for(gpu, needed);
+        if capacity > self.capacity { self.rebuild(gpu, &Plan::default(), capacity) } else { Ok(()) }
     }
 
     /// Applies a plan to the parameters, their averages, the moments and the histories. A child inherits its parent's moments and has no
@@ -87,51 +130,23 @@ impl GpuCloud {
     /// The Gaussians after a change, with room for `capacity`. Buffers are replaced one at a time: the old and the new ones never stand beside
     /// each other in full.
     fn rebuild(&mut self, gpu: &Gpu, plan: &Plan, capacity: usize) -> Result<(), GpuError> {
-        let list = plan.changes();
-        let changes = GpuBuffer::storage(gpu, "changes", (list.len() * 4) as u64)?;
-        changes.write(gpu, 0, &list);
-        let (kept, children) = (plan.kept(self.count) as u32, 2 * plan.divided.len() as u32);
-        let removed = plan.removed.len() as u32;
-        let (capacity_in, capacity_out) = (self.capacity as u32, capacity as u32);
-        let gather_setup = GatherSetup { kept, children, removed, capacity_in, capacity_out, pad: [0; 3] };
-        let divide_setup = DivideSetup {
-            first: kept,
-            children,
-            parents: removed,
-            capacity: capacity_out,
-            round: self.rounds as f32,
-            pad: [0; 3],
-        };
+        let gathering = Gathering::new(gpu, plan, self, capacity)?;
         let (sh_degree, resized) = (self.sh_degree, capacity != self.capacity);
         let Self { parameters, moments_1, moments_2, averages, histories, spare, spare_histories, kernels, uniforms, .. } = self;
-        uniforms.begin();
-        let setup = uniforms.put(&gather_setup);
-        let of_children = uniforms.put(&divide_setup);
-        uniforms.upload(gpu);
-        let size = workgroups((kept + children).div_ceil(256));
-        let gather = |from: &GpuBuffer, to: &GpuBuffer| {
-            let mut encoder = gpu.device.create_command_encoder(&Default::default());
-            let mut pass = encoder.begin_compute_pass(&Default::default());
-            kernels.gather.dispatch(gpu, &mut pass, &[(0, uniforms.of(setup)), (1, &changes), (2, from), (3, to)], size);
-            drop(pass);
-            gpu.submit(encoder);
-        };
+        let by = (&*kernels, &*uniforms);
         for buffer in [&mut *parameters, moments_1, moments_2, &mut *averages] {
             // An old one of another size is given back before the new one is made.
             let to = spare.take().filter(|_| !resized).map_or_else(|| allocate(gpu, sh_degree, capacity), Ok)?;
-            gather(buffer, &to);
+            gathering.gather(gpu, by, buffer, &to);
             *spare = Some(std::mem::replace(buffer, to));
         }
         let to = spare_histories.take().filter(|_| !resized).map_or_else(|| allocate_histories(gpu, capacity), Ok)?;
-        gather(histories, &to);
+        gathering.gather(gpu, by, histories, &to);
         *spare_histories = Some(std::mem::replace(histories, to));
+        let Gathering { changes, kept, children, of_children, .. } = gathering;
         if children > 0 {
             let bindings = [(0, uniforms.of(of_children)), (1, &changes), (2, &*parameters), (3, &*averages), (4, &*histories)];
-            let mut encoder = gpu.device.create_command_encoder(&Default::default());
-            let mut pass = encoder.begin_compute_pass(&Default::default());
-            kernels.divide.dispatch(gpu, &mut pass, &bindings, workgroups(children.div_ceil(256)));
-            drop(pass);
-            gpu.submit(encoder);
+            dispatch(gpu, &kernels.divide, &bindings, children);
         }
         if resized {
             (*spare, *spare_histories) = (None, None);

@@ -36,8 +36,7 @@ impl GpuCloud {
             drop(read);
             for RunMotion { run, new_from_old } in motions {
                 let run = run.start - span.start..run.end - span.start;
-                move_geometry(&mut planes, run.clone(), new_from_old);
-                rotate_harmonics(&mut planes, run, new_from_old);
+                move_planes(&mut planes.iter_mut().map(|plane| &mut plane[run.clone()]).collect::<Vec<_>>(), new_from_old);
             }
             planes.iter().enumerate().for_each(|(plane, values)| buffer.write(gpu, place(plane), values));
         }
@@ -55,11 +54,17 @@ impl GpuCloud {
     }
 }
 
-/// Centres, log scales and rotations, `[planes, N]`.
-fn move_geometry(planes: &mut [Vec<[f32; 4]>], run: Range<usize>, new_from_old: &Sim3) {
+/// Moves Gaussians, `[planes, N]`.
+pub(super) fn move_planes(planes: &mut [&mut [[f32; 4]]], new_from_old: &Sim3) {
+    move_geometry(planes, new_from_old);
+    rotate_harmonics(planes, new_from_old);
+}
+
+/// Centres, log scales and rotations.
+fn move_geometry(planes: &mut [&mut [[f32; 4]]], new_from_old: &Sim3) {
     let [x, y, z, w] = new_from_old.rotation.coords.map(|v| v as f32).into();
     let (turn, growth) = (Quat::from_xyzw(x, y, z, w), new_from_old.scale.ln() as f32);
-    for i in run {
+    for i in 0..planes[0].len() {
         let [x, y, z, raw_opacity] = planes[0][i];
         let p = new_from_old.act(&Point3::new(x, y, z).cast());
         planes[0][i] = [p.x as f32, p.y as f32, p.z as f32, raw_opacity];
@@ -71,15 +76,15 @@ fn move_geometry(planes: &mut [Vec<[f32; 4]>], run: Range<usize>, new_from_old: 
     }
 }
 
-/// Harmonics above the constant, which is the same in every direction, `[planes, N]`.
-fn rotate_harmonics(planes: &mut [Vec<[f32; 4]>], run: Range<usize>, new_from_old: &Sim3) {
+/// Harmonics above the constant, which is the same in every direction.
+fn rotate_harmonics(planes: &mut [&mut [[f32; 4]]], new_from_old: &Sim3) {
     let harmonics = &mut planes[GEOMETRY_PLANES + 1..];
     if harmonics.is_empty() {
         return;
     }
     let rotation = ShRotation::new(&new_from_old.rotation);
     let mut coefficients = vec![Vector3::zeros(); harmonics.len() + 1];
-    for i in run {
+    for i in 0..harmonics[0].len() {
         for (to, plane) in coefficients[1..].iter_mut().zip(&*harmonics) {
             *to = Vector3::new(plane[i][0], plane[i][1], plane[i][2]).cast();
         }

@@ -1,0 +1,279 @@
+//! Out-of-core mapping: Gaussians that no keyframe of the window sees leave the GPU for the disk, and come back when one does, as in DiskChunGS.
+//!
+//! A chunk is a few dozen neighbours, divided anew each time Gaussians leave. A ball around it says which keyframes see it.
+
+mod balls;
+mod sight;
+mod store;
+
+use std::cell::Cell;
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::PathBuf;
+
+use serde::{Deserialize, Serialize};
+
+pub(super) use self::balls::{Ball, parts};
+pub(super) use self::sight::{Outlook, Sight};
+use self::store::{Store, Stored};
+use super::{KeyframeId, MappingError};
+use crate::geometry::Sim3;
+use crate::render::CloudPart;
+use crate::splat::{GaussianCloud, ShDegree};
+
+/// Number of a chunk, in the order in which they left.
+pub(super) type ChunkId = u64;
+
+/// What went to the disk, and what came back.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct PagingFigures {
+    /// Gaussians that left the GPU, counted each time.
+    pub gaussians_out: u64,
+    /// Gaussians that came back.
+    pub gaussians_in: u64,
+    /// The most that were away at a time.
+    pub most_away: u64,
+}
+
+/// Gaussians with the keyframes that they were inserted from.
+pub(super) struct Members {
+    pub part: CloudPart,
+    /// `[N]`
+    pub keyframes: Vec<KeyframeId>,
+}
+
+/// Neighbouring Gaussians that are not on the GPU.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+struct Chunk {
+    ball: Ball,
+    gaussians: usize,
+    /// Round of density control in which it left.
+    round: u32,
+    /// How the keyframes of its Gaussians have moved since.
+    motions: BTreeMap<KeyframeId, Sim3>,
+    keyframes: BTreeSet<KeyframeId>,
+    stored: Stored,
+}
+
+/// A chunk that has come back, and whose place in the file may not be used again yet.
+#[derive(Debug)]
+struct Returned {
+    id: ChunkId,
+    chunk: Chunk,
+    in_snapshot: bool,
+    in_checkpoint: bool,
+}
+
+/// All Gaussians that are not on the GPU.
+#[derive(Debug)]
+pub(super) struct Chunks {
+    state: ChunksState,
+    returned: Vec<Returned>,
+    /// So many of these had come back before the last download.
+    downloaded: Cell<usize>,
+    store: Store,
+    /// Whether there are checkpoints.
+    lasting: bool,
+}
+
+/// The chunks of a checkpoint; their Gaussians lie in a file beside it.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+pub(super) struct ChunksState {
+    away: BTreeMap<ChunkId, Chunk>,
+    next: ChunkId,
+    figures: PagingFigures,
+}
+
+impl Chunks {
+    /// None yet. What leaves the GPU goes to the file, where that of an earlier run is removed, or to an unnamed one. Where it is `lasting`, what the last
+    /// checkpoint names stays until the next.
+    pub fn begin(file: Option<PathBuf>, lasting: bool) -> Self {
+        Self { state: ChunksState::default(), returned: Vec::new(), downloaded: Cell::new(0), store: Store::begin(file), lasting }
+    }
+
+    /// Those of a checkpoint.
+    ///
+    /// # Errors
+    /// If the file is missing or too short.
+    pub fn restore(file: Option<PathBuf>, state: &ChunksState) -> Result<Self, MappingError> {
+        let store = Store::restore(file, state.away.values().map(|chunk| &chunk.stored))?;
+        Ok(Self { state: state.clone(), returned: Vec::new(), downloaded: Cell::new(0), store, lasting: true })
+    }
+
+    /// What a checkpoint needs. The file is flushed to the disk.
+    ///
+    /// # Errors
+    /// If it cannot be.
+    pub fn state(&self) -> Result<ChunksState, MappingError> {
+        self.store.flush()?;
+        Ok(self.state.clone())
+    }
+
+    /// A checkpoint of the present state has been written.
+    pub fn checkpoint_is_written(&mut self) {
+        self.returned.iter_mut().for_each(|returned| returned.in_checkpoint = false);
+        self.reuse_places();
+    }
+
+    /// The Gaussians on the GPU have been downloaded. Returns which ones are away now; they stay on the disk until the next download.
+    pub fn snapshot(&self) -> BTreeSet<ChunkId> {
+        self.downloaded.set(self.returned.len());
+        self.state.away.keys().copied().collect()
+    }
+
+    fn reuse_places(&mut self) {
+        let Self { returned, downloaded, store, .. } = self;
+        returned[..downloaded.take()].iter_mut().for_each(|returned| returned.in_snapshot = false);
+        returned.retain(|returned| {
+            let is_kept = returned.in_snapshot || returned.in_checkpoint;
+            if !is_kept {
+                store.give_back(&returned.chunk.stored);
+            }
+            is_kept
+        });
+    }
+
+    pub fn figures(&self) -> PagingFigures {
+        self.state.figures
+    }
+
+    /// Whether all Gaussians are on the GPU.
+    pub fn are_here(&self) -> bool {
+        self.state.away.is_empty()
+    }
+
+    /// Number of Gaussians that are not on the GPU.
+    pub fn gaussians_away(&self) -> usize {
+        self.state.away.values().map(|chunk| chunk.gaussians).sum()
+    }
+
+    /// Number of Gaussians of a chunk.
+    pub fn gaussians(&self, chunk: ChunkId) -> usize {
+        self.state.away[&chunk].gaussians
+    }
+
+    /// Whether a view sees nothing of what is away.
+    pub fn is_complete(&self, outlook: &Outlook<'_>) -> bool {
+        !self.state.away.values().any(|chunk| outlook.sees(&chunk.ball))
+    }
+
+    /// Chunks that a view sees, the nearest first.
+    pub fn seen_by(&self, outlook: &Outlook<'_>) -> Vec<ChunkId> {
+        let seen = self.state.away.iter().filter(|(_, chunk)| outlook.sees(&chunk.ball));
+        let mut seen: Vec<(f32, ChunkId)> = seen.map(|(id, chunk)| (outlook.depth(&chunk.ball), *id)).collect();
+        seen.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+        seen.into_iter().map(|(_, id)| id).collect()
+    }
+
+    /// Takes in Gaussians that leave the GPU in this round of density control.
+    pub fn put(&mut self, members: &Members, round: u32) {
+        self.reuse_places();
+        let id = self.state.next;
+        self.state.next += 1;
+        let chunk = Chunk {
+            ball: Ball::around(&members.part.extents()),
+            gaussians: members.part.len(),
+            round,
+            motions: BTreeMap::new(),
+            keyframes: members.keyframes.iter().copied().collect(),
+            stored: self.store.put(members),
+        };
+        self.state.figures.gaussians_out += chunk.gaussians as u64;
+        self.state.away.insert(id, chunk);
+        self.state.figures.most_away = self.state.figures.most_away.max(self.gaussians_away() as u64);
+    }
+
+    /// A chunk that comes back in this round: as it left, but for how its keyframes have moved since.
+    ///
+    /// # Errors
+    /// If it cannot be read or has changed.
+    pub fn get(&self, chunk: ChunkId, sh_degree: ShDegree, round: u32) -> Result<Members, MappingError> {
+        let chunk = &self.state.away[&chunk];
+        let mut members = self.read(chunk, sh_degree)?;
+        members.part.rejuvenate(round - chunk.round);
+        Ok(members)
+    }
+
+    fn read(&self, chunk: &Chunk, sh_degree: ShDegree) -> Result<Members, MappingError> {
+        let mut members = self.store.get(&chunk.stored, chunk.gaussians, sh_degree)?;
+        for (keyframe, new_from_old) in &chunk.motions {
+            let moved: Vec<usize> = (0..chunk.gaussians).filter(|i| members.keyframes[*i] == *keyframe).collect();
+            members.part.transform(&moved, new_from_old);
+        }
+        Ok(members)
+    }
+
+    /// A chunk is on the GPU again.
+    pub fn is_back(&mut self, id: ChunkId) {
+        let Some(chunk) = self.state.away.remove(&id) else { return };
+        self.state.figures.gaussians_in += chunk.gaussians as u64;
+        self.returned.push(Returned { id, chunk, in_snapshot: true, in_checkpoint: self.lasting });
+    }
+
+    /// Keyframes have moved, and their Gaussians with them.
+    pub fn transform(&mut self, motions: &BTreeMap<KeyframeId, Sim3>) {
+        if motions.is_empty() {
+            return;
+        }
+        for chunk in self.state.away.values_mut() {
+            let mut reached: Vec<Ball> = Vec::new();
+            for keyframe in &chunk.keyframes {
+                let mut ball = chunk.ball;
+                if let Some(new_from_old) = motions.get(keyframe) {
+                    let before = chunk.motions.get(keyframe).copied().unwrap_or(Sim3::identity());
+                    chunk.motions.insert(*keyframe, *new_from_old * before);
+                    ball.transform(new_from_old);
+                }
+                reached.push(ball);
+            }
+            chunk.ball = Ball::around_balls(&reached);
+        }
+    }
+
+    /// Removes the Gaussians of keyframes; returns how many were away.
+    ///
+    /// # Errors
+    /// If a chunk with Gaussians of others, too, cannot be read.
+    pub fn remove(&mut self, keyframes: &BTreeSet<KeyframeId>, sh_degree: ShDegree) -> Result<usize, MappingError> {
+        let before = self.gaussians_away();
+        let has_some = |(id, chunk): (&ChunkId, &Chunk)| (!chunk.keyframes.is_disjoint(keyframes)).then_some(*id);
+        let affected: Vec<ChunkId> = self.state.away.iter().filter_map(has_some).collect();
+        for id in affected {
+            let chunk = &self.state.away[&id];
+            let members = self.read(chunk, sh_degree)?;
+            let stay: Vec<usize> = (0..chunk.gaussians).filter(|i| !keyframes.contains(&members.keyframes[*i])).collect();
+            let round = chunk.round;
+            if let Some(chunk) = self.state.away.remove(&id) {
+                self.returned.push(Returned { id, chunk, in_snapshot: true, in_checkpoint: self.lasting });
+            }
+            if !stay.is_empty() {
+                self.put(&members.picked(&stay), round);
+            }
+        }
+        Ok(before - self.gaussians_away())
+    }
+
+    /// Adds the Gaussians of chunks that were away at a download to what was downloaded, as they are shown.
+    ///
+    /// # Errors
+    /// If one cannot be read or has changed.
+    pub fn complete(&self, map: &mut GaussianCloud, away: &BTreeSet<ChunkId>) -> Result<(), MappingError> {
+        let (sh_degree, antialiased) = (map.sh_degree, map.antialiased);
+        let returned = self.returned.iter().map(|returned| (&returned.id, &returned.chunk));
+        for (_, chunk) in self.state.away.iter().chain(returned).filter(|(id, _)| away.contains(id)) {
+            map.append(&self.read(chunk, sh_degree)?.part.shown(sh_degree, antialiased));
+        }
+        Ok(())
+    }
+
+    /// All that are away.
+    pub fn away(&self) -> BTreeSet<ChunkId> {
+        self.state.away.keys().copied().collect()
+    }
+}
+
+impl Members {
+    /// Some of them.
+    pub fn picked(&self, which: &[usize]) -> Self {
+        Self { part: self.part.picked(which), keyframes: which.iter().map(|i| self.keyframes[*i]).collect() }
+    }
+}

@@ -1,0 +1,202 @@
+//! Gaussians off the GPU with all that training knows of them: how a map larger than the GPU's memory is kept, and how training goes on elsewhere.
+
+use bytemuck::Zeroable;
+use glam::Vec3;
+use serde::{Deserialize, Serialize};
+
+use super::change::Gathering;
+use super::motion::move_planes;
+use super::{BUFFERS, GaussianHistory, GpuCloud, allocate, allocate_histories, cloud_from_planes, planes};
+use crate::geometry::Sim3;
+use crate::gpu::{Gpu, GpuError, Part, plain};
+use crate::render::plan::Plan;
+use crate::splat::{GaussianCloud, ShDegree};
+
+/// The averages' place among the buffers.
+const AVERAGES: usize = 3;
+
+/// Gaussians with their moments, averages and histories.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct CloudPart {
+    /// `[BUFFERS, planes, N]`: parameters, first and second moments, averages.
+    #[serde(with = "plain")]
+    values: Vec<[f32; 4]>,
+    /// `[N]`
+    #[serde(with = "plain")]
+    pub(super) histories: Vec<GaussianHistory>,
+}
+
+impl CloudPart {
+    pub(super) fn with_capacity(planes: usize, count: usize) -> Self {
+        Self { values: Vec::with_capacity(BUFFERS * planes * count), histories: Vec::new() }
+    }
+
+    /// Number of Gaussians.
+    pub fn len(&self) -> usize {
+        self.histories.len()
+    }
+
+    /// Whether there are no Gaussians.
+    pub fn is_empty(&self) -> bool {
+        self.histories.is_empty()
+    }
+
+    /// Whether it has all values of its Gaussians, of this degree.
+    pub(super) fn is_whole(&self, sh_degree: ShDegree) -> bool {
+        self.values.len() == BUFFERS * planes(sh_degree) * self.len()
+    }
+
+    /// Appends the planes of a buffer.
+    pub(super) fn read_planes<'a>(&mut self, gpu: &Gpu, parts: impl Iterator<Item = Part<'a>>) -> Result<(), GpuError> {
+        let parts: Vec<Part<'_>> = parts.collect();
+        let read = gpu.read(None, &parts)?;
+        (0..parts.len()).for_each(|plane| self.values.extend(read.part::<[f32; 4]>(plane)));
+        Ok(())
+    }
+
+    /// Some of its Gaussians.
+    pub fn picked(&self, which: &[usize]) -> Self {
+        let planes = self.values.chunks_exact(self.len().max(1));
+        let values = planes.flat_map(|plane| which.iter().map(|i| plane[*i])).collect();
+        Self { values, histories: which.iter().map(|i| self.histories[*i]).collect() }
+    }
+
+    /// Several parts as one, in order.
+    pub fn joined<'a>(parts: impl Iterator<Item = &'a Self> + Clone) -> Self {
+        let planes = parts.clone().find(|part| !part.is_empty()).map_or(0, |part| part.values.len() / part.len());
+        let of_plane = |plane: usize| parts.clone().flat_map(move |part| &part.values[plane * part.len()..][..part.len()]);
+        let values = (0..planes).flat_map(of_plane).copied().collect();
+        Self { values, histories: parts.flat_map(|part| part.histories.iter().copied()).collect() }
+    }
+
+    /// The same in bytes, in the byte order of the machine.
+    pub fn to_bytes(&self) -> Vec<u8> {
+        [bytemuck::cast_slice::<_, u8>(&self.values), bytemuck::cast_slice(&self.histories)].concat()
+    }
+
+    /// `count` Gaussians of this degree from [`Self::to_bytes`]; `None` if there are more bytes or fewer.
+    pub fn from_bytes(bytes: &[u8], sh_degree: ShDegree, count: usize) -> Option<Self> {
+        let mut values = vec![[0.0f32; 4]; BUFFERS * planes(sh_degree) * count];
+        let mut histories = vec![GaussianHistory::zeroed(); count];
+        let (of_values, of_histories) = bytes.split_at_checked(std::mem::size_of_val(&*values))?;
+        if of_histories.len() != std::mem::size_of_val(&*histories) {
+            return None;
+        }
+        bytemuck::cast_slice_mut(&mut values).copy_from_slice(of_values);
+        bytemuck::cast_slice_mut(&mut histories).copy_from_slice(of_histories);
+        Some(Self { values, histories })
+    }
+
+    /// Centres and largest standard deviations, metres, as training has them.
+    pub fn extents(&self) -> Vec<(Vec3, f32)> {
+        let count = self.len();
+        (0..count).map(|i| extent(&self.values[i], &self.values[count + i])).collect()
+    }
+
+    /// The Gaussians as they are shown, see [`GpuCloud::download`].
+    pub fn shown(&self, sh_degree: ShDegree, antialiased: bool) -> GaussianCloud {
+        let (planes, count) = (planes(sh_degree), self.len());
+        let plane = |plane: usize| self.values[(AVERAGES * planes + plane) * count..][..count].to_vec();
+        let averages: Vec<Vec<[f32; 4]>> = (0..planes).map(plane).collect();
+        shown(sh_degree, antialiased, &averages)
+    }
+
+    /// Moves some Gaussians and clears their moments, as [`GpuCloud::transform`] does.
+    pub fn transform(&mut self, which: &[usize], new_from_old: &Sim3) {
+        let count = self.len();
+        if which.is_empty() {
+            return;
+        }
+        let of_buffer = self.values.len() / BUFFERS;
+        for (buffer, values) in self.values.chunks_exact_mut(of_buffer).enumerate() {
+            let planes = values.chunks_exact_mut(count);
+            if buffer == 0 || buffer == AVERAGES {
+                let mut planes: Vec<&mut [[f32; 4]]> = planes.collect();
+                let mut moved: Vec<Vec<[f32; 4]>> =
+                    planes.iter().map(|plane| which.iter().map(|i| plane[*i]).collect()).collect();
+                move_planes(&mut moved.iter_mut().map(Vec::as_mut_slice).collect::<Vec<_>>(), new_from_old);
+                for (plane, moved) in planes.iter_mut().zip(moved) {
+                    which.iter().zip(moved).for_each(|(i, value)| plane[*i] = value);
+                }
+            } else {
+                planes.for_each(|plane| which.iter().for_each(|i| plane[*i] = [0.0; 4]));
+            }
+        }
+    }
+
+    /// Its Gaussians are younger by so many rounds of density control: those in which they were away.
+    pub fn rejuvenate(&mut self, rounds: u32) {
+        self.histories.iter_mut().for_each(|history| history.came += rounds as f32);
+    }
+}
+
+impl GpuCloud {
+    /// A copy of the Gaussians at these places, ascending. Needs no memory beyond [`GpuCloud::bytes_each`].
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
+    pub fn copy_out(&mut self, gpu: &Gpu, places: &[u32]) -> Result<CloudPart, GpuError> {
+        let mut wanted = places.iter().copied().peekable();
+        let others = (0..self.len() as u32).filter(|place| wanted.next_if_eq(place).is_none()).collect();
+        let gathering = Gathering::new(gpu, &Plan::removing(others), self, self.capacity)?;
+        let mut part = CloudPart::with_capacity(self.planes(), places.len());
+        let spare = self.spare.take().map_or_else(|| allocate(gpu, self.sh_degree, self.capacity), Ok)?;
+        for buffer in self.buffers() {
+            gathering.gather(gpu, (&self.kernels, &self.uniforms), buffer, &spare);
+            let plane = |plane: usize| spare.part::<[f32; 4]>(plane * self.capacity, places.len());
+            part.read_planes(gpu, (0..self.planes()).map(plane))?;
+        }
+        self.spare = Some(spare);
+        let spare = self.spare_histories.take().map_or_else(|| allocate_histories(gpu, self.capacity), Ok)?;
+        gathering.gather(gpu, (&self.kernels, &self.uniforms), &self.histories, &spare);
+        part.histories = spare.read(gpu, 0, places.len())?;
+        self.spare_histories = Some(spare);
+        Ok(part)
+    }
+
+    /// Centres and largest standard deviations of the Gaussians from the place `first` on, metres, as training has them.
+    ///
+    /// # Errors
+    /// [`GpuError`] if the device fails.
+    pub fn extents(&self, gpu: &Gpu, first: usize) -> Result<Vec<(Vec3, f32)>, GpuError> {
+        let plane = |plane: usize| self.parameters.part::<[f32; 4]>(plane * self.capacity + first, self.count - first);
+        let read = gpu.read(None, &[plane(0), plane(1)])?;
+        let (positions, scales) = (read.part::<[f32; 4]>(0), read.part::<[f32; 4]>(1));
+        Ok(positions.iter().zip(&scales).map(|(position, scale)| extent(position, scale)).collect())
+    }
+
+    /// Appends Gaussians that were here before, as they were.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit or the device fails.
+    pub fn put_back(&mut self, gpu: &Gpu, part: &CloudPart) -> Result<(), GpuError> {
+        assert!(part.is_whole(self.sh_degree), "a map has one spherical-harmonics degree");
+        self.reserve(gpu, self.count + part.len())?;
+        self.write(gpu, self.count, part);
+        self.count += part.len();
+        Ok(())
+    }
+
+    /// Writes all values of a part from the place `first` on.
+    pub(super) fn write(&self, gpu: &Gpu, first: usize, part: &CloudPart) {
+        self.histories.write(gpu, first, &part.histories);
+        let buffers = self.buffers();
+        for (i, plane) in part.values.chunks_exact(part.len().max(1)).enumerate() {
+            buffers[i / self.planes()].write(gpu, (i % self.planes()) * self.capacity + first, plane);
+        }
+    }
+}
+
+fn extent(position: &[f32; 4], scale: &[f32; 4]) -> (Vec3, f32) {
+    (Vec3::new(position[0], position[1], position[2]), scale[0].max(scale[1]).max(scale[2]).exp())
+}
+
+/// A map as it is shown, of the planes of its averages, `[planes][N]`.
+pub(super) fn shown(sh_degree: ShDegree, antialiased: bool, averages: &[Vec<[f32; 4]>]) -> GaussianCloud {
+    let mut cloud = cloud_from_planes(sh_degree, averages);
+    if antialiased {
+        cloud.antialiased = true;
+        cloud.smooth(averages[1].iter().map(|scale| scale[3]));
+    }
+    cloud
+}
