@@ -136,7 +136,7 @@ impl FloorPlan {
     }
 }
 
-/// The solids under construction, and which rooms each belongs to.
+/// The rooms, and the solids that belong to each.
 pub struct Rooms {
     pub plan: FloorPlan,
     /// Indices into the scene's solids, for each room; a wall belongs to the rooms on both sides.
@@ -186,14 +186,14 @@ impl Rooms {
             masonry.block(low.with_z(high.z), high + DVec3::Z * WALL, Material::Ceiling);
             of_room.extend([first, first + 1]);
         }
-        for (axis, sides, low, high) in plan.walls() {
+        for wall in plan.walls() {
             let first = masonry.solids.len();
-            let door = match sides {
+            let door = match wall.sides {
                 [Some(a), Some(b)] if a.abs_diff(b) == 1 => Some(&plan.doors[a.min(b)]),
                 _ => None,
             };
-            masonry.wall(low, high, door, 1 - axis);
-            for room in sides.into_iter().flatten() {
+            masonry.wall(&wall, door);
+            for room in wall.sides.into_iter().flatten() {
                 self.solids[room].extend((first..masonry.solids.len()).map(|k| k as u32));
             }
         }
@@ -201,8 +201,14 @@ impl Rooms {
     }
 }
 
-/// A wall: the axis it is normal to, the rooms before and behind it, and its corners.
-type Wall = (usize, [Option<usize>; 2], DVec3, DVec3);
+struct Wall {
+    /// Axis that the wall runs along.
+    along: usize,
+    /// Rooms on its lower and upper side.
+    sides: [Option<usize>; 2],
+    low: DVec3,
+    high: DVec3,
+}
 
 impl FloorPlan {
     /// All walls. Those normal to x run through; those normal to y fit between them.
@@ -214,11 +220,12 @@ impl FloorPlan {
             if row < self.grid[1] {
                 let sides = [self.number(column.checked_sub(1), Some(row)), here];
                 let high = dvec3(at.x, at.y + self.room.y + WALL * 0.5, self.room.z);
-                walls.push((0, sides, at - dvec3(WALL, WALL * 0.5, 0.0), high));
+                walls.push(Wall { along: 1, sides, low: at - dvec3(WALL, WALL * 0.5, 0.0), high });
             }
             if column < self.grid[0] {
                 let sides = [self.number(Some(column), row.checked_sub(1)), here];
-                walls.push((1, sides, at - DVec3::Y * WALL, dvec3(at.x + self.room.x, at.y, self.room.z)));
+                let high = dvec3(at.x + self.room.x, at.y, self.room.z);
+                walls.push(Wall { along: 0, sides, low: at - DVec3::Y * WALL, high });
             }
         }
         walls
@@ -240,8 +247,9 @@ impl Masonry<'_> {
         self.add(Shape::Block { half: (high - low) * 0.5 }, (low + high) * 0.5, material);
     }
 
-    /// A wall that runs along an axis, in one piece or with a doorway under a lintel.
-    fn wall(&mut self, low: DVec3, high: DVec3, door: Option<&Doorway>, along: usize) {
+    /// A wall in one piece, or with a doorway under a lintel.
+    fn wall(&mut self, wall: &Wall, door: Option<&Doorway>) {
+        let &Wall { along, low, high, .. } = wall;
         let Some(door) = door else { return self.block(low, high, Material::Room) };
         let cut = |mut p: DVec3, at: f64| {
             p[along] = at;

@@ -21,7 +21,18 @@ fn building() -> SceneConfig {
 }
 
 fn no_furniture() -> FurnitureConfig {
-    FurnitureConfig { tables: 0, shelves: 0, sofas: 0, cabinets: 0, lamps: 0, plants: 0, boxes: 0, rugs: 0, pictures: 0, windows: 0 }
+    FurnitureConfig {
+        tables: 0,
+        shelves: 0,
+        sofas: 0,
+        cabinets: 0,
+        lamps: 0,
+        plants: 0,
+        boxes: 0,
+        rugs: 0,
+        pictures: 0,
+        windows: 0,
+    }
 }
 
 fn error(edit: impl Fn(&mut SceneConfig)) -> String {
@@ -61,7 +72,8 @@ fn a_walk_is_smooth_and_looks_round_in_each_room() {
     (config.path.shake_metres, config.path.shake_degrees) = (0.0, 0.0);
     let path = CameraPath::new(&config).unwrap();
     let step_s = 0.02;
-    let poses: Vec<Se3> = (0..(479.0 / config.fps / step_s) as usize).map(|k| path.world_from_camera(k as f64 * step_s)).collect();
+    let poses: Vec<Se3> =
+        (0..(479.0 / config.fps / step_s) as usize).map(|k| path.world_from_camera(k as f64 * step_s)).collect();
     let mut directions = [[false; 8]; 4];
     for pair in poses.windows(2) {
         assert!((pair[1].translation.vector - pair[0].translation.vector).norm() <= config.path.speed * step_s * 1.01);
@@ -113,9 +125,8 @@ fn nothing_is_seen_through_a_wall() {
 fn rooms_differ_and_are_lit() {
     let config = building();
     let recording = Recording::new(&config).unwrap();
-    let means: Vec<Vec3> = [60, 180, 300, 420]
-        .map(|frame| recording.render(frame).color.iter().sum::<Vec3>() / (32.0 * 24.0))
-        .to_vec();
+    let means: Vec<Vec3> =
+        [60, 180, 300, 420].map(|frame| recording.render(frame).color.iter().sum::<Vec3>() / (32.0 * 24.0)).to_vec();
     assert!(means.iter().all(|mean| (0.08..0.9).contains(&(mean.element_sum() / 3.0))), "{means:?}");
     let plan = Plan::new(&config).unwrap();
     let (rooms, mut looks) = (&plan.rooms, std::collections::BTreeSet::new());
