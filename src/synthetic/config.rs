@@ -74,7 +74,7 @@ impl Default for CameraConfig {
     }
 }
 
-/// The room, metres.
+/// The room, or each room of a building, metres.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RoomConfig {
@@ -84,17 +84,25 @@ pub struct RoomConfig {
     pub depth: f64,
     /// Floor to ceiling.
     pub height: f64,
+    /// Rooms along x and along y, all of the size above; doorways join them in one chain. More than one need a path of kind `walk`.
+    #[serde(skip_serializing_if = "is_one_room")]
+    pub rooms: [usize; 2],
     /// 0 for purely diffuse surfaces, whose look does not depend on where one stands; up to 1 for highlights on wood, glaze, metal.
     pub gloss: f64,
 }
 
 impl Default for RoomConfig {
     fn default() -> Self {
-        Self { width: 6.0, depth: 5.2, height: 2.7, gloss: 0.0 }
+        Self { width: 6.0, depth: 5.2, height: 2.7, rooms: [1, 1], gloss: 0.0 }
     }
 }
 
-/// How many of each piece stand in the room.
+/// Scenes from before there were buildings keep their files and digests.
+fn is_one_room(rooms: &[usize; 2]) -> bool {
+    *rooms == [1, 1]
+}
+
+/// How many of each piece stand in each room.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct FurnitureConfig {
@@ -134,6 +142,8 @@ pub enum PathKind {
     Sweep,
     /// Round the room, looking outwards, back to the start.
     Loop,
+    /// Once through all rooms, and once round in each.
+    Walk,
 }
 
 /// The camera's path.
@@ -145,7 +155,7 @@ pub struct PathConfig {
     /// Times round the room, for a loop; the last frame is back at the start.
     pub rounds: u32,
     /// The most that the path itself, without the hand's shake, moves, m/s. A sweep goes at the pace that this and the turning
-    /// rate allow together; a loop takes as long as there are frames.
+    /// rate allow together; loops and walks take as long as there are frames.
     pub speed: f64,
     /// The most that the path itself turns, degrees/s.
     pub turn_rate: f64,
@@ -190,6 +200,10 @@ pub struct DegradationConfig {
 
 /// More pixels than this a frame would take minutes to render, and is surely a slip of the pen.
 const MAX_SIDE: u32 = 8192;
+/// More rooms than this would take hours to render.
+const MAX_ROOMS: usize = 100;
+/// Pieces in one room, and in all rooms of a building.
+const MAX_PIECES: (usize, usize) = (400, 4000);
 /// More frames than this is an hour at 30 Hz.
 const MAX_FRAMES: usize = 108_000;
 
@@ -205,6 +219,7 @@ impl SceneConfig {
         within("room.depth", room.depth, 3.5, 60.0)?;
         within("room.height", room.height, 2.2, 5.0)?;
         within("room.gloss", room.gloss, 0.0, 1.0)?;
+        self.validate_building()?;
         let path = &self.path;
         within("path.speed", path.speed, 0.01, 5.0)?;
         within("path.turn_rate", path.turn_rate, 0.5, 360.0)?;
@@ -215,7 +230,30 @@ impl SceneConfig {
         self.validate_degradation()?;
         let f = &self.furniture;
         let counts = [f.tables, f.shelves, f.sofas, f.cabinets, f.lamps, f.plants, f.boxes, f.rugs, f.pictures, f.windows];
-        within("furniture (pieces in all)", counts.iter().fold(0usize, |sum, n| sum.saturating_add(*n)) as f64, 0.0, 400.0)
+        let most = MAX_PIECES.0.min(MAX_PIECES.1 / (room.rooms[0] * room.rooms[1]));
+        let pieces = counts.iter().fold(0usize, |sum, n| sum.saturating_add(*n));
+        within("furniture (pieces in a room)", pieces as f64, 0.0, most as f64)
+    }
+
+    /// What a building of several rooms cannot have.
+    fn validate_building(&self) -> Result<(), SceneError> {
+        let [columns, rows] = self.room.rooms;
+        if columns == 0 || rows == 0 || columns.saturating_mul(rows) > MAX_ROOMS {
+            let what = format!("is [{columns}, {rows}]; give rooms along x and along y, 1 to {MAX_ROOMS} in all");
+            return Err(SceneError::Field { field: "room.rooms", what });
+        }
+        let refused = |field, what: &str| Err(SceneError::Field { field, what: what.into() });
+        if is_one_room(&self.room.rooms) {
+            Ok(())
+        } else if self.path.kind != PathKind::Walk {
+            refused("path.kind", "must be \"walk\" where `room.rooms` has more than one room")
+        } else if self.furniture.windows > 0 {
+            refused("furniture.windows", "must be 0 where `room.rooms` has more than one room: most walls are inner ones")
+        } else if self.degradation.moving_object {
+            refused("degradation.moving_object", "must be false where `room.rooms` has more than one room")
+        } else {
+            Ok(())
+        }
     }
 
     fn validate_camera(&self) -> Result<(), SceneError> {

@@ -9,7 +9,7 @@ use rayon::prelude::*;
 
 use super::config::SceneConfig;
 use super::light::Scene;
-use super::room::position;
+use super::room::{axes, position};
 use super::shapes::{Primitive, Ray, Shape};
 use super::{Plan, SceneError};
 use crate::geometry::{Camera, Se3};
@@ -34,16 +34,25 @@ pub fn visible_surface(config: &SceneConfig) -> Result<Mesh, SceneError> {
     let eyes = Eyes {
         camera: config.camera(),
         range: Some(config.degradation.max_range).filter(|range| *range > 0.0).unwrap_or(f64::INFINITY),
-        poses: plan.sampled.iter().map(|(_, pose)| *pose).collect(),
-        scene: Scene::new(plan.solids),
+        poses: by_room(&plan),
+        scene: Scene::new(plan.solids, plan.rooms),
     };
     let mut mesh = Mesh::default();
     for solid in &eyes.scene.solids {
-        for chart in 0..solid.shape.charts().len() {
+        for chart in (0..solid.shape.charts().len()).filter(|chart| solid.material.shows(*chart)) {
             eyes.append(&Patch::new(solid, chart), &mut mesh);
         }
     }
     Ok(mesh.without_loose_vertices())
+}
+
+fn by_room(plan: &Plan) -> Vec<Vec<Se3>> {
+    let rooms = &plan.rooms.plan;
+    let mut poses = vec![Vec::new(); rooms.rooms()];
+    for (_, pose) in &plan.sampled {
+        poses[rooms.seen_from(position(pose), &axes(pose))].iter_mut().for_each(|of_room| of_room.push(*pose));
+    }
+    poses
 }
 
 /// A chart's part of a solid's surface as a grid.
@@ -92,14 +101,15 @@ impl<'a> Patch<'a> {
 struct Eyes {
     camera: Camera,
     range: f64,
-    poses: Vec<Se3>,
+    /// For each room, those that may see into it.
+    poses: Vec<Vec<Se3>>,
     scene: Scene,
 }
 
 impl Eyes {
     /// Whether any pose sees a point of a surface.
     fn see(&self, p: DVec3) -> bool {
-        self.poses.iter().any(|pose| self.shows(pose, p))
+        self.poses[self.scene.rooms.plan.room_at(p)].iter().any(|pose| self.shows(pose, p))
     }
 
     fn shows(&self, world_from_camera: &Se3, p: DVec3) -> bool {

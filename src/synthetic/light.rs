@@ -6,6 +6,7 @@
 use glam::{DVec2, DVec3, Vec3};
 use rayon::prelude::*;
 
+use super::building::Rooms;
 use super::bvh::Bvh;
 use super::room::radiance;
 use super::shapes::{ChartPoint, Primitive, Ray};
@@ -28,13 +29,14 @@ const ADAPTATION: f32 = 0.75;
 /// The solids with their tree, as light and camera rays meet them.
 pub struct Scene {
     pub solids: Vec<Primitive>,
+    pub rooms: Rooms,
     bvh: Bvh,
 }
 
 impl Scene {
-    pub fn new(solids: Vec<Primitive>) -> Self {
+    pub fn new(solids: Vec<Primitive>, rooms: Rooms) -> Self {
         let bvh = Bvh::new(&solids);
-        Self { solids, bvh }
+        Self { solids, rooms, bvh }
     }
 
     /// The first surface along a ray that starts in the room.
@@ -142,9 +144,13 @@ pub struct Lighting {
 impl Lighting {
     pub fn compute(scene: &Scene) -> Self {
         let lights = scene.lights();
+        let plan = &scene.rooms.plan;
+        let room_of: Vec<usize> = lights.iter().map(|light| plan.room_at(light.middle)).collect();
         let direct = grids(scene, |point, solid| {
             let (p, normal) = lifted(solid, point);
-            lights.iter().map(|light| light.irradiance(scene, p, normal)).sum()
+            let here = plan.room_at(p);
+            let near = lights.iter().zip(&room_of).filter(|(_, room)| plan.joined(here, **room));
+            near.map(|(light, _)| light.irradiance(scene, p, normal)).sum()
         });
         let reflectance: Vec<Vec<Vec3>> = scene.solids.iter().map(mean_reflectance).collect();
         let directions = cosine_directions();
@@ -161,8 +167,8 @@ impl Lighting {
         let mut grids = direct;
         let add = |(to, from): (&mut LightGrid, &LightGrid)| to.values.iter_mut().zip(&from.values).for_each(|(a, b)| *a += *b);
         grids.iter_mut().flatten().zip(bounced.iter().flatten()).for_each(add);
-        let shell: Vec<Vec3> = grids[0][..5].iter().flat_map(|grid| grid.values.iter().copied()).collect();
-        let mean = shell.iter().sum::<Vec3>() / shell.len() as f32;
+        let around = surroundings(scene, &grids);
+        let mean = around.iter().sum::<Vec3>() / around.len() as f32;
         let gray = mean.element_sum().max(1e-6) / 3.0;
         let exposure = (mean.max(Vec3::splat(1e-6)) / gray).powf(-ADAPTATION) * (WHITE / gray);
         grids.iter_mut().flatten().flat_map(|grid| &mut grid.values).for_each(|v| *v *= exposure);
@@ -180,17 +186,33 @@ impl Lighting {
     }
 }
 
+/// Light on walls and floor, which sets the exposure.
+fn surroundings(scene: &Scene, grids: &[Vec<LightGrid>]) -> Vec<Vec3> {
+    if scene.solids[0].material == Material::Room {
+        return grids[0][..5].iter().flat_map(|grid| grid.values.iter().copied()).collect();
+    }
+    // The far side of outer walls has none.
+    let seen = scene.solids.iter().zip(grids).filter(|(solid, _)| matches!(solid.material, Material::Room | Material::Floor));
+    seen.flat_map(|(_, grids)| grids).flat_map(|grid| &grid.values).copied().filter(|v| *v != Vec3::ZERO).collect()
+}
+
 /// Fills a grid on every chart of every solid.
 fn grids(scene: &Scene, irradiance: impl Fn(&ChartPoint, &Primitive) -> Vec3 + Sync) -> Vec<Vec<LightGrid>> {
     let bounds: Vec<(DVec3, DVec3)> = scene.solids.iter().map(Primitive::bounds).collect();
-    let covered = |index: usize, p: DVec3| {
-        let hides = |(k, (low, high)): (usize, &(DVec3, DVec3))| {
-            k != index && k != 0 && p.cmpgt(*low).all() && p.cmplt(*high).all() && scene.solids[k].contains(p)
-        };
-        (index != 0 && scene.solids[0].contains(p)) || bounds.iter().enumerate().any(hides)
+    let beside = |index: usize| -> Vec<usize> {
+        let (low, high) = (bounds[index].0 - 2.0 * LIFT, bounds[index].1 + 2.0 * LIFT);
+        let meets = |k: &usize| *k != index && bounds[*k].0.cmplt(high).all() && bounds[*k].1.cmpgt(low).all();
+        (1..bounds.len()).filter(meets).collect()
     };
-    let of_chart = |index: usize, chart: usize, size: DVec2| {
+    let covered = |index: usize, beside: &[usize], p: DVec3| {
+        let hides = |k: &usize| p.cmpgt(bounds[*k].0).all() && p.cmplt(bounds[*k].1).all() && scene.solids[*k].contains(p);
+        (index != 0 && scene.solids[0].contains(p)) || beside.iter().any(hides)
+    };
+    let of_chart = |index: usize, beside: &[usize], chart: usize, size: DVec2| {
         let solid = &scene.solids[index];
+        if !solid.material.shows(chart) {
+            return LightGrid::uniform(size, Vec3::ZERO);
+        }
         let count = |metres: f64| (metres / CELL_METRES).ceil().clamp(CELLS.0, CELLS.1);
         let (width, height) = (count(size.x), count(size.y));
         let cell = DVec2::new(size.x / width, size.y / height);
@@ -198,14 +220,15 @@ fn grids(scene: &Scene, irradiance: impl Fn(&ChartPoint, &Primitive) -> Vec3 + S
         let value = |i: usize| {
             let uv = DVec2::new((i % width) as f64 + 0.5, (i / width) as f64 + 0.5) * cell;
             let point = solid.shape.point_at(chart, uv);
-            (!covered(index, lifted(solid, &point).0)).then(|| irradiance(&point, solid))
+            (!covered(index, beside, lifted(solid, &point).0)).then(|| irradiance(&point, solid))
         };
         let values = filled((0..width * height).map(value).collect(), width, height);
         LightGrid { width, height, cell, values }
     };
     let of_solid = |index: usize| {
         let charts = scene.solids[index].shape.charts();
-        charts.into_par_iter().enumerate().map(|(chart, size)| of_chart(index, chart, size)).collect()
+        let beside = beside(index);
+        charts.into_par_iter().enumerate().map(|(chart, size)| of_chart(index, &beside, chart, size)).collect()
     };
     (0..scene.solids.len()).into_par_iter().map(of_solid).collect()
 }

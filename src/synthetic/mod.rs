@@ -1,10 +1,13 @@
-//! Synthetic recordings: a furnished, textured room, ray-cast along a hand-held camera's path with exact depth and poses, written
+//! Synthetic recordings: a furnished, textured room or a building of them, ray-cast along a hand-held camera's path with exact depth and poses, written
 //! in TUM's layout.
 //!
-//! `config` says what a scene is; `room` and `furniture` build it, `light` and `surface` bake how it looks, `path` moves
-//! the camera, `render` casts the rays, `degrade` is the sensor. It leaves out: mirrors and glass, deforming things, rolling
+//! `config` says what a scene is; `building`, `room` and `furniture` build it, `light` and `surface` bake how it looks, `path` and
+//! `walk` move the camera, `render` casts the rays, `degrade` is the sensor. It leaves out: mirrors and glass, deforming things, rolling
 //! shutter, and shadows of the moving object.
 
+mod building;
+#[cfg(test)]
+mod building_tests;
 mod bvh;
 mod config;
 mod degrade;
@@ -21,6 +24,7 @@ mod surface;
 mod tests;
 mod texture;
 mod view;
+mod walk;
 mod write;
 
 use std::path::{Path, PathBuf};
@@ -35,6 +39,8 @@ use crate::geometry::{Camera, Distortion, Pinhole, Se3, StampedPose, Trajectory}
 pub use config::{CameraConfig, DegradationConfig, FurnitureConfig, PathConfig, PathKind, RoomConfig, SceneConfig};
 pub use exact::visible_surface;
 
+use building::Rooms;
+use light::Scene;
 use path::CameraPath;
 use render::{Moment, Rendered, Renderer};
 use shapes::Primitive;
@@ -43,7 +49,7 @@ use shapes::Primitive;
 const RENDERER_VERSION: u32 = 1;
 /// Moments averaged over an exposure. Nine, so that each also takes its own place in a 3 x 3 grid of the pixel.
 const BLUR_MOMENTS: usize = 9;
-/// Poses of the path that furnishing looks at.
+/// Poses of the path that furnishing looks at, for each room.
 const PATH_SAMPLES: usize = 160;
 
 /// A scene that cannot be rendered or written.
@@ -81,13 +87,15 @@ pub enum SceneError {
         /// What is wrong.
         what: String,
     },
-    /// The rounds need more frames.
+    /// The rounds, or the rooms of a walk, need more frames.
     #[error(
-        "`frames` is {frames}, too few for {rounds} rounds at the allowed pace; give at least {needed}, or raise `path.speed` and `path.turn_rate`"
+        "`frames` is {frames}, too few for {rounds} {of} at the allowed pace; give at least {needed}, or raise `path.speed` and `path.turn_rate`"
     )]
     TooFewFrames {
-        /// Rounds of the path.
+        /// Rounds of the path, or rooms.
         rounds: u32,
+        /// What is counted: rounds or rooms.
+        of: &'static str,
         /// Frames of the scene.
         frames: usize,
         /// Value needed.
@@ -180,10 +188,11 @@ impl SceneConfig {
     }
 }
 
-/// A furnished room and the way through it, checked, before anything is lit or rendered.
+/// A furnished room or building and the way through it, checked, before anything is lit or rendered.
 struct Plan {
     path: CameraPath,
     solids: Vec<Primitive>,
+    rooms: Rooms,
     mover: Option<room::Mover>,
     /// Times and poses along the path.
     sampled: Vec<(f64, Se3)>,
@@ -194,14 +203,14 @@ impl Plan {
         config.validate()?;
         check_lens(&config.camera())?;
         let path = CameraPath::new(config)?;
-        let every = config.frames.div_ceil(PATH_SAMPLES);
+        let every = config.frames.div_ceil(PATH_SAMPLES * config.room.rooms.iter().product::<usize>());
         let timed = |frame: usize| (frame as f64 / config.fps, path.world_from_camera(frame as f64 / config.fps));
         let sampled: Vec<(f64, Se3)> = (0..config.frames).step_by(every).map(timed).collect();
         let poses: Vec<Se3> = sampled.iter().map(|(_, pose)| *pose).collect();
-        let solids = room::furnish(config, &poses)?;
-        check_clearance(config, &path, &solids)?;
+        let (solids, rooms) = room::furnish(config, &poses)?;
+        check_clearance(config, &path, &solids, &rooms)?;
         let mover = config.degradation.moving_object.then(|| room::Mover::new(config, &sampled, &solids)).transpose()?;
-        Ok(Self { path, solids, mover, sampled })
+        Ok(Self { path, solids, rooms, mover, sampled })
     }
 }
 
@@ -214,8 +223,8 @@ struct Recording<'a> {
 
 impl<'a> Recording<'a> {
     fn new(config: &'a SceneConfig) -> Result<Self, SceneError> {
-        let Plan { path, solids, mover, sampled } = Plan::new(config)?;
-        let renderer = Renderer::new(&config.camera(), solids, mover, config.room.gloss);
+        let Plan { path, solids, rooms, mover, sampled } = Plan::new(config)?;
+        let renderer = Renderer::new(&config.camera(), Scene::new(solids, rooms), mover, config.room.gloss);
         let moment = |(time_s, pose): &(f64, Se3)| Moment { world_from_camera: *pose, time_s: *time_s, subpixel: DVec2::ZERO };
         renderer.warm_up(&sampled.iter().step_by(8).map(moment).collect::<Vec<_>>());
         Ok(Self { config, path, renderer })
@@ -292,10 +301,10 @@ fn check_lens(camera: &Camera) -> Result<(), SceneError> {
     Ok(())
 }
 
-fn check_clearance(config: &SceneConfig, path: &CameraPath, solids: &[Primitive]) -> Result<(), SceneError> {
+fn check_clearance(config: &SceneConfig, path: &CameraPath, solids: &[Primitive], rooms: &Rooms) -> Result<(), SceneError> {
     for frame in 0..config.frames {
         let p = room::position(&path.world_from_camera(frame as f64 / config.fps));
-        let distance_metres = solids.iter().map(|solid| solid.distance(p)).fold(f64::INFINITY, f64::min);
+        let distance_metres = rooms.solids_near(p).map(|k| solids[k].distance(p)).fold(f64::INFINITY, f64::min);
         if distance_metres < room::MIN_CLEARANCE {
             return Err(SceneError::TooClose { frame, distance_metres });
         }

@@ -1,4 +1,4 @@
-//! The camera's way through the room: a smooth curve walked at a bounded pace, with a hand's shake on top.
+//! The camera's way through the room or the building: a smooth curve walked at a bounded pace, with a hand's shake on top.
 //!
 //! World: z up, origin in the room's corner, so the room is `0..width × 0..depth × 0..height`.
 
@@ -8,7 +8,9 @@ use fastrand::Rng;
 use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion, Vector3};
 
 use super::SceneError;
+use super::building::FloorPlan;
 use super::config::{PathConfig, PathKind, SceneConfig};
+use super::walk::Walk;
 use crate::geometry::Se3;
 
 /// Samples of the curve per turn of its parameter, fine enough that the pace is even.
@@ -19,10 +21,10 @@ const SHAKE_WAVES: usize = 6;
 
 /// Position in the room, and where the camera looks: metres and radians.
 #[derive(Clone, Copy)]
-struct Station {
-    position: Vector3<f64>,
-    yaw_rad: f64,
-    pitch_rad: f64,
+pub struct Station {
+    pub position: Vector3<f64>,
+    pub yaw_rad: f64,
+    pub pitch_rad: f64,
 }
 
 struct Wave {
@@ -33,7 +35,10 @@ struct Wave {
 
 pub struct CameraPath {
     kind: PathKind,
+    /// Rounds of a loop, rooms of a walk: turns of the curve's parameter.
     rounds: f64,
+    /// Through the rooms of a building.
+    walk: Option<Walk>,
     room: Vector3<f64>,
     height: f64,
     /// Seconds at which each sample of the curve is reached, going as fast as allowed.
@@ -47,13 +52,19 @@ pub struct CameraPath {
 impl CameraPath {
     pub fn new(config: &SceneConfig) -> Result<Self, SceneError> {
         let path = &config.path;
-        let rounds = if path.kind == PathKind::Loop { path.rounds } else { 1 };
+        let plan = FloorPlan::new(config);
+        let (rounds, of) = match path.kind {
+            PathKind::Sweep => (1, "sweeps"),
+            PathKind::Loop => (path.rounds, "rounds"),
+            PathKind::Walk => (plan.rooms() as u32, "rooms"),
+        };
         let room = Vector3::new(config.room.width, config.room.depth, config.room.height);
         let mut rng = Rng::with_seed(config.seed ^ 0x05EE_D0FA_11AD);
         let shake = (0..6).map(|axis| shake_waves(path, axis, &mut rng)).collect();
         let mut this = Self {
             kind: path.kind,
             rounds: f64::from(rounds),
+            walk: (path.kind == PathKind::Walk).then(|| Walk::new(&plan, path.height)),
             room,
             height: path.height,
             reached_s: vec![0.0],
@@ -67,12 +78,12 @@ impl CameraPath {
             let pace = ((b.position - a.position).norm() / path.speed).hypot(turned / path.turn_rate.to_radians());
             this.reached_s.push(this.reached_s[i] + pace);
         }
-        if path.kind == PathKind::Loop {
+        if path.kind != PathKind::Sweep {
             let needed_s = this.reached_s[samples];
             let given_s = (config.frames.max(2) - 1) as f64 / config.fps;
             if needed_s > given_s * (1.0 + 1e-9) {
                 let needed = (needed_s * config.fps).ceil() as usize + 1;
-                return Err(SceneError::TooFewFrames { rounds, frames: config.frames, needed });
+                return Err(SceneError::TooFewFrames { rounds, of, frames: config.frames, needed });
             }
             this.rate = needed_s / given_s;
         }
@@ -100,9 +111,10 @@ impl CameraPath {
     }
 
     fn station(&self, phi: f64) -> Station {
-        match self.kind {
-            PathKind::Sweep => self.sweep(phi),
-            PathKind::Loop => self.round(phi),
+        match (&self.walk, self.kind) {
+            (Some(walk), _) => walk.station(phi / (TAU * self.rounds)),
+            (None, PathKind::Sweep) => self.sweep(phi),
+            (None, _) => self.round(phi),
         }
     }
 

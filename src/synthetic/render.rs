@@ -14,7 +14,7 @@ use super::texture::Place;
 use super::view::View;
 use crate::geometry::{Camera, Se3};
 
-/// Distance, metres, at which a texel of furniture (the first) or of the room's shell (the second) is as large as a pixel: about the
+/// Distance, metres, at which a texel of furniture (the first) or of walls, floor and ceiling (the second) is as large as a pixel: about the
 /// nearest at which the camera sees them.
 const TEXEL_RANGE_METRES: (f64, f64) = (1.0, 1.7);
 /// Sub-pixel places of the further samples at edges; with the centre they make the five of a die.
@@ -69,8 +69,7 @@ pub struct Renderer {
 }
 
 impl Renderer {
-    pub fn new(camera: &Camera, solids: Vec<Primitive>, mover: Option<Mover>, gloss: f64) -> Self {
-        let scene = Scene::new(solids);
+    pub fn new(camera: &Camera, scene: Scene, mover: Option<Mover>, gloss: f64) -> Self {
         let lighting = Lighting::compute(&scene);
         let moving = mover.as_ref().map(|m| m.at(0.0)).unwrap_or_default();
         let charts = |solid: &Primitive| solid.shape.charts().iter().map(|_| OnceLock::new()).collect();
@@ -106,7 +105,7 @@ impl Renderer {
             .par_iter()
             .flat_map_iter(|moment| {
                 let moving = self.moving(moment.time_s);
-                let view = View::new(&moment.world_from_camera, &self.scene.solids, &moving);
+                let view = View::new(&moment.world_from_camera, &self.scene, &moving);
                 let mut candidates = Vec::new();
                 let mut met = Vec::new();
                 for tile in &self.tiles {
@@ -136,6 +135,11 @@ impl Renderer {
         });
     }
 
+    #[cfg(test)]
+    pub fn rooms(&self) -> &super::building::Rooms {
+        &self.scene.rooms
+    }
+
     fn solid(&self, index: usize) -> Primitive {
         let still = self.scene.solids.len();
         match &self.mover {
@@ -152,7 +156,7 @@ impl Renderer {
                 Some(moving) => &self.mover_light[moving][chart],
                 None => &self.lighting.grids[index][chart],
             };
-            let range = if index == 0 { TEXEL_RANGE_METRES.1 } else { TEXEL_RANGE_METRES.0 };
+            let range = if solid.material.is_structure() { TEXEL_RANGE_METRES.1 } else { TEXEL_RANGE_METRES.0 };
             let emission = solid.material.emission();
             Surface::bake(size, range / self.focal, solid.shape.wraps(chart), |uv| {
                 let place = Place { uv: uv.as_vec2(), size: size.as_vec2(), chart };
@@ -170,7 +174,7 @@ impl Renderer {
     /// Renders a moment; `smooth_edges` adds samples where surfaces meet.
     pub fn render(&self, moment: &Moment, smooth_edges: bool) -> Rendered {
         let moving = self.moving(moment.time_s);
-        let view = View::new(&moment.world_from_camera, &self.scene.solids, &moving);
+        let view = View::new(&moment.world_from_camera, &self.scene, &moving);
         let mut color = vec![Vec3::ZERO; self.rays.len()];
         let mut geometry = vec![Geometry::default(); self.rays.len()];
         let mut candidates = Vec::new();

@@ -1,9 +1,12 @@
-//! Furnishes the room: draws places for each piece until it stands free of the others and clear of the camera's path.
+//! Furnishes the rooms: draws places for each piece until it stands free of the others and clear of the camera's path.
 
 use fastrand::Rng;
 use glam::{DMat3, DVec2, DVec3, Vec3, dvec3};
+use nalgebra::Translation3;
+use rayon::prelude::*;
 
 use super::SceneError;
+use super::building::{FloorPlan, Rooms};
 use super::config::{RoomConfig, SceneConfig};
 use super::furniture::Piece;
 use super::shapes::{Primitive, Shape};
@@ -18,14 +21,57 @@ pub const MIN_CLEARANCE: f64 = 0.4;
 const TRIES: usize = 1500;
 /// Candidate places of a piece, compared by the share of it that the camera sees.
 const CHOICES: usize = 14;
+/// Poses so far outside of a room still count for its furnishing, metres.
+const NEAR_ROOM: f64 = 1.0;
 /// Gap between two pieces, metres.
 const GAP: f64 = 0.04;
 
-/// The furnished room. Solid 0 is the shell.
-pub fn furnish(config: &SceneConfig, path: &[Se3]) -> Result<Vec<Primitive>, SceneError> {
+/// The furnished room or building. Solid 0 is the shell.
+pub fn furnish(config: &SceneConfig, path: &[Se3]) -> Result<(Vec<Primitive>, Rooms), SceneError> {
+    let mut rooms = Rooms::new(FloorPlan::new(config));
+    let mut rng = Rng::with_seed(config.seed);
+    if rooms.plan.rooms() == 1 {
+        let solids = furnish_room(config, path, rng, &[])?;
+        rooms.give(0, 0..solids.len());
+        return Ok((solids, rooms));
+    }
+    let mut solids = rooms.build(&mut rng);
+    let seeds: Vec<u64> = (0..rooms.plan.rooms()).map(|_| rng.u64(..)).collect();
+    let plan = &rooms.plan;
+    let furnished: Result<Vec<Vec<Primitive>>, SceneError> = seeds
+        .into_par_iter()
+        .enumerate()
+        .map(|(room, seed)| {
+            let corner = plan.corner(room);
+            let poses = poses_near(plan, room, path);
+            // Solid 0 is the shell of a lone room.
+            Ok(place(&furnish_room(config, &poses, Rng::with_seed(seed), &plan.aisles(room))?[1..], DMat3::IDENTITY, corner))
+        })
+        .collect();
+    for (room, pieces) in furnished?.into_iter().enumerate() {
+        rooms.give(room, solids.len()..solids.len() + pieces.len());
+        solids.extend(pieces);
+    }
+    Ok((solids, rooms))
+}
+
+/// Poses in a room and just outside of it, moved to the room's own frame.
+fn poses_near(plan: &FloorPlan, room: usize, path: &[Se3]) -> Vec<Se3> {
+    let corner = plan.corner(room);
+    let near = |p: DVec3| p.cmpgt(DVec3::splat(-NEAR_ROOM)).all() && p.cmplt(plan.room + NEAR_ROOM).all();
+    let shift = Translation3::new(-corner.x, -corner.y, -corner.z);
+    path.iter().filter(|pose| near(position(pose) - corner)).map(|pose| shift * pose).collect()
+}
+
+/// A shell with what stands in it, around `aisles` (boxes) that stay free.
+fn furnish_room(
+    config: &SceneConfig,
+    path: &[Se3],
+    mut rng: Rng,
+    aisles: &[(DVec3, DVec3)],
+) -> Result<Vec<Primitive>, SceneError> {
     let room = &config.room;
     let half = dvec3(room.width, room.depth, room.height) * 0.5;
-    let mut rng = Rng::with_seed(config.seed);
     let seed = rng.u32(..);
     let shell = Primitive {
         shape: Shape::Shell { half },
@@ -34,7 +80,7 @@ pub fn furnish(config: &SceneConfig, path: &[Se3]) -> Result<Vec<Primitive>, Sce
         material: Material::Room,
         seed,
     };
-    let mut layout = Layout { room, path, rng, solids: vec![shell], taken: Vec::new() };
+    let mut layout = Layout { room, path, rng, solids: vec![shell], taken: aisles.to_vec() };
     layout.lights();
     let f = &config.furniture;
     // Large and wall-bound things first, while there is room.
@@ -180,6 +226,13 @@ impl Layout<'_> {
 pub fn position(pose: &Se3) -> DVec3 {
     let t = pose.translation.vector;
     dvec3(t.x, t.y, t.z)
+}
+
+/// The camera's axes in the world.
+pub fn axes(pose: &Se3) -> DMat3 {
+    let r = pose.rotation.to_rotation_matrix();
+    let column = |k: usize| dvec3(r[(0, k)], r[(1, k)], r[(2, k)]);
+    DMat3::from_cols(column(0), column(1), column(2))
 }
 
 /// Whether a point lies well inside what a usual lens sees from `pose`.

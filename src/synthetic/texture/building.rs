@@ -5,9 +5,9 @@ use glam::{Vec2, Vec3};
 use super::super::noise::{hash, octaves, ramp, spots, unit, value};
 use super::{Place, border, line};
 
-/// Charts of the room's shell, as `shapes` numbers a box's faces.
-const FLOOR: usize = 4;
-const CEILING: usize = 5;
+/// Charts of the room's shell (lower and upper face), as `shapes` numbers a box's faces.
+pub const FLOOR: usize = 4;
+pub const CEILING: usize = 5;
 
 pub fn room(place: &Place, seed: u32) -> Vec3 {
     match place.chart {
@@ -27,7 +27,7 @@ pub fn room(place: &Place, seed: u32) -> Vec3 {
 }
 
 /// Floorboards 14 cm wide, of random length, colour and grain.
-fn planks(p: Vec2, seed: u32) -> Vec3 {
+pub fn planks(p: Vec2, seed: u32) -> Vec3 {
     const WIDTH: f32 = 0.14;
     const LENGTH: f32 = 1.3;
     let row = (p.y / WIDTH).floor();
@@ -159,7 +159,7 @@ fn skirting(place: &Place, wall: Vec3, seed: u32) -> Vec3 {
 }
 
 /// Square acoustic tiles with random pin holes.
-fn ceiling(p: Vec2, seed: u32) -> Vec3 {
+pub fn ceiling(p: Vec2, seed: u32) -> Vec3 {
     let cell = (p / 0.6).floor();
     let shade = 0.84 + 0.06 * unit(cell.x as i32, cell.y as i32, seed);
     let (hole, tag) = spots(p * 45.0, 0.24, seed ^ 0x41);

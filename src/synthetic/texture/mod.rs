@@ -23,8 +23,14 @@ pub struct Place {
 
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Material {
-    /// The six faces of the room: walls, floor, ceiling.
+    /// The six faces of the room: walls, floor, ceiling. Of a building, a wall.
     Room,
+    /// Upper side of a building's floor slab.
+    Floor,
+    /// Lower side of a building's ceiling slab.
+    Ceiling,
+    /// What lies around a building; nobody sees it.
+    Outside,
     Wood {
         tint: Vec3,
     },
@@ -90,10 +96,28 @@ impl Material {
         }
     }
 
+    /// Whether it is what rooms are made of, not a piece in them.
+    pub fn is_structure(&self) -> bool {
+        matches!(self, Self::Room | Self::Floor | Self::Ceiling | Self::Outside)
+    }
+
+    /// Whether a camera may ever see the chart of a box of it.
+    pub fn shows(&self, chart: usize) -> bool {
+        match self {
+            Self::Floor => chart == building::CEILING,
+            Self::Ceiling => chart == building::FLOOR,
+            Self::Outside => false,
+            _ => true,
+        }
+    }
+
     /// Linear reflectance (or own light before [`Self::emission`]) at a place; `seed` tells solids of one material apart.
     pub fn color(&self, place: &Place, seed: u32) -> Vec3 {
         let seen = match *self {
             Self::Room => building::room(place, seed),
+            Self::Floor => building::planks(place.uv, seed),
+            Self::Ceiling => building::ceiling(place.uv, seed),
+            Self::Outside => Vec3::splat(0.5),
             Self::Wood { tint } => building::wood(place, tint, seed),
             Self::Metal { tint } => building::metal(place, tint, seed),
             Self::Terrazzo { tint } => building::terrazzo(place, tint, seed),
