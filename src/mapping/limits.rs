@@ -67,9 +67,9 @@ impl LimitsConfig {
         self.max_gpu_bytes.map_or(usize::MAX, most).max(LEAST_GAUSSIANS)
     }
 
-    /// Bytes of `bytes` in use that don't depend on the number of Gaussians, when a map with room for `capacity` has `map_bytes`.
-    pub(super) fn other_bytes(bytes: u64, map_bytes: u64, capacity: usize) -> u64 {
-        bytes.saturating_sub(map_bytes + capacity as u64 * SCRATCH_BYTES_EACH)
+    /// Bytes of `bytes` in use that don't depend on the number of Gaussians, when the map has `map_bytes` and the last step had room for `stepped` of them.
+    pub(super) fn other_bytes(bytes: u64, map_bytes: u64, stepped: usize) -> u64 {
+        bytes.saturating_sub(map_bytes + stepped as u64 * SCRATCH_BYTES_EACH)
     }
 
     /// The most images of `image_bytes` each on the GPU.

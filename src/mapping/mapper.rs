@@ -96,6 +96,8 @@ pub struct Mapper {
     controlled_at: usize,
     /// Whether a map of others began this one.
     has_initial_map: bool,
+    /// Gaussians that the buffers of the last step had room for.
+    stepped_capacity: usize,
     /// Whether the adapter has no room for more Gaussians, which is reported once.
     is_full: bool,
     /// Whether a keyframe has seen more than the GPU has room for, which is reported once.
@@ -129,6 +131,7 @@ impl Mapper {
             epoch: Vec::new(),
             controlled_at: 0,
             has_initial_map: false,
+            stepped_capacity: 0,
             is_full: false,
             is_short: false,
             config: Arc::new(config),
@@ -321,9 +324,9 @@ impl Mapper {
         let mut scoring = if controlled { self.scoring_steps(&window, density) } else { Vec::new() };
         scoring.truncate(iterations);
         let unscored = iterations - scoring.len();
-        let has_older = self.keyframes.len() > window.len();
-        let older = self.complete(0..if has_older { self.keyframes.len().saturating_sub(config.window.recent) } else { 0 });
-        let mut before = schedule::steps(&window, &older, unscored, &mut self.rng, &config.window);
+        let (len, mut rng) = (self.keyframes.len(), self.rng.clone());
+        let mut before = schedule::steps(&window, (len, &|k| self.is_complete(k)), unscored, &mut rng, &config.window);
+        self.rng = rng;
         let mut after = before.split_off((density.after_share * unscored as f32).round() as usize);
         // Together where they are one batch: the host waits once.
         if !controlled {
@@ -406,6 +409,7 @@ impl Mapper {
         if let Some(density) = judged {
             self.density.prepare(&self.gpu, &density.setup(&self.map_size()))?;
         }
+        self.stepped_capacity = self.cloud.capacity();
         let judge = judged.map(|_| self.density.verdicts(&self.gpu, &self.cloud));
         let then = judge.as_ref().map(|judge| judge as &dyn OverScores);
         let (reports, verdicts) = self.trainer.steps_and_then(&self.cloud, &views, (&self.config.loss, adam), then)?;

@@ -51,7 +51,7 @@ fn a_lost_device_ends_the_run_with_what_was_mapped() {
             }
             gpu.device.destroy();
         });
-        pipeline::run(&recording, gpu, progress, None).unwrap()
+        pipeline::run(&recording, gpu, progress, None, None).unwrap()
     });
     assert!(matches!(gpu_error(&replay), GpuError::Failed(_)), "{:?}", replay.error);
     assert_written("lost-device", &recording, &replay);

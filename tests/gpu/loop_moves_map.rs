@@ -145,7 +145,7 @@ fn scaled_depths_are_resumed() {
         mapper.update_poses(&[PoseUpdate { scale: 1.004, ..updates[5] }]).unwrap();
         let state = mapper.state(None).unwrap();
         assert_ne!(bytes(&mapper), before);
-        let mut resumed = Mapper::restore(gpu.clone(), &config, &state).unwrap();
+        let mut resumed = Mapper::restore(gpu.clone(), &config, &state, None).unwrap();
         keyframes.iter().for_each(|keyframe| resumed.insert_again(keyframe, &state).unwrap());
         assert!(bytes(&resumed) == bytes(&mapper));
         for mapper in [&mut mapper, &mut resumed] {

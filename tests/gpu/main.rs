@@ -14,6 +14,7 @@ mod loop_moves_map;
 mod mapper;
 mod motion;
 mod oracle;
+mod paging;
 mod properties;
 mod reference_gradients;
 mod scores;

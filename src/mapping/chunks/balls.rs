@@ -7,9 +7,9 @@ use serde::{Deserialize, Serialize};
 use crate::geometry::Sim3;
 
 /// Gaussians of a group, at most.
-const PART: usize = 48;
-/// A Gaussian is drawn up to so many standard deviations.
-const EXTENT: f32 = 2.0;
+const PART: usize = 32;
+/// Beyond so many standard deviations, a Gaussian of a group adds little.
+const EXTENT: f32 = 1.0;
 
 /// Centre and radius, metres.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]

@@ -3,6 +3,7 @@
 //! A chunk is a few dozen neighbours, divided anew each time Gaussians leave. A ball around it says which keyframes see it.
 
 mod balls;
+mod index;
 mod sight;
 mod store;
 
@@ -13,6 +14,7 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 pub(super) use self::balls::{Ball, parts};
+use self::index::Index;
 pub(super) use self::sight::{Outlook, Sight};
 use self::store::{Store, Stored};
 use super::{KeyframeId, MappingError};
@@ -48,9 +50,10 @@ struct Chunk {
     gaussians: usize,
     /// Round of density control in which it left.
     round: u32,
-    /// How the keyframes of its Gaussians have moved since.
+    /// Number of Gaussians of each keyframe,
+    keyframes: BTreeMap<KeyframeId, usize>,
+    /// and how these have moved since.
     motions: BTreeMap<KeyframeId, Sim3>,
-    keyframes: BTreeSet<KeyframeId>,
     stored: Stored,
 }
 
@@ -67,6 +70,7 @@ struct Returned {
 #[derive(Debug)]
 pub(super) struct Chunks {
     state: ChunksState,
+    index: Index,
     returned: Vec<Returned>,
     /// So many of these had come back before the last download.
     downloaded: Cell<usize>,
@@ -87,7 +91,7 @@ impl Chunks {
     /// None yet. What leaves the GPU goes to the file, where that of an earlier run is removed, or to an unnamed one. Where it is `lasting`, what the last
     /// checkpoint names stays until the next.
     pub fn begin(file: Option<PathBuf>, lasting: bool) -> Self {
-        Self { state: ChunksState::default(), returned: Vec::new(), downloaded: Cell::new(0), store: Store::begin(file), lasting }
+        Self { state: ChunksState::default(), index: Index::default(), returned: Vec::new(), downloaded: Cell::new(0), store: Store::begin(file), lasting }
     }
 
     /// Those of a checkpoint.
@@ -96,7 +100,7 @@ impl Chunks {
     /// If the file is missing or too short.
     pub fn restore(file: Option<PathBuf>, state: &ChunksState) -> Result<Self, MappingError> {
         let store = Store::restore(file, state.away.values().map(|chunk| &chunk.stored))?;
-        Ok(Self { state: state.clone(), returned: Vec::new(), downloaded: Cell::new(0), store, lasting: true })
+        Ok(Self { state: state.clone(), index: state.index(), returned: Vec::new(), downloaded: Cell::new(0), store, lasting: true })
     }
 
     /// What a checkpoint needs. The file is flushed to the disk.
@@ -153,13 +157,13 @@ impl Chunks {
 
     /// Whether a view sees nothing of what is away.
     pub fn is_complete(&self, outlook: &Outlook<'_>) -> bool {
-        !self.state.away.values().any(|chunk| outlook.sees(&chunk.ball))
+        self.index.seen_by(outlook).next().is_none()
     }
 
     /// Chunks that a view sees, the nearest first.
     pub fn seen_by(&self, outlook: &Outlook<'_>) -> Vec<ChunkId> {
-        let seen = self.state.away.iter().filter(|(_, chunk)| outlook.sees(&chunk.ball));
-        let mut seen: Vec<(f32, ChunkId)> = seen.map(|(id, chunk)| (outlook.depth(&chunk.ball), *id)).collect();
+        let mut seen: Vec<(f32, ChunkId)> =
+            self.index.seen_by(outlook).map(|(id, ball)| (outlook.depth(ball), id)).collect();
         seen.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
         seen.into_iter().map(|(_, id)| id).collect()
     }
@@ -169,15 +173,18 @@ impl Chunks {
         self.reuse_places();
         let id = self.state.next;
         self.state.next += 1;
+        let mut keyframes = BTreeMap::new();
+        members.keyframes.iter().for_each(|keyframe| *keyframes.entry(*keyframe).or_default() += 1);
         let chunk = Chunk {
             ball: Ball::around(&members.part.extents()),
             gaussians: members.part.len(),
             round,
+            keyframes,
             motions: BTreeMap::new(),
-            keyframes: members.keyframes.iter().copied().collect(),
             stored: self.store.put(members),
         };
         self.state.figures.gaussians_out += chunk.gaussians as u64;
+        self.index.insert(id, chunk.ball);
         self.state.away.insert(id, chunk);
         self.state.figures.most_away = self.state.figures.most_away.max(self.gaussians_away() as u64);
     }
@@ -204,21 +211,25 @@ impl Chunks {
 
     /// A chunk is on the GPU again.
     pub fn is_back(&mut self, id: ChunkId) {
+        self.state.figures.gaussians_in += self.gaussians(id) as u64;
+        self.forget(id);
+    }
+
+    fn forget(&mut self, id: ChunkId) {
         let Some(chunk) = self.state.away.remove(&id) else { return };
-        self.state.figures.gaussians_in += chunk.gaussians as u64;
+        self.index.remove(id, &chunk.ball);
         self.returned.push(Returned { id, chunk, in_snapshot: true, in_checkpoint: self.lasting });
     }
 
-    /// Keyframes have moved, and their Gaussians with them.
-    pub fn transform(&mut self, motions: &BTreeMap<KeyframeId, Sim3>) {
-        if motions.is_empty() {
-            return;
-        }
+    /// Keyframes have moved, and their Gaussians with them; returns how many of these are away.
+    pub fn transform(&mut self, motions: &BTreeMap<KeyframeId, Sim3>) -> usize {
+        let mut moved = 0;
         for chunk in self.state.away.values_mut() {
             let mut reached: Vec<Ball> = Vec::new();
-            for keyframe in &chunk.keyframes {
+            for (keyframe, gaussians) in &chunk.keyframes {
                 let mut ball = chunk.ball;
                 if let Some(new_from_old) = motions.get(keyframe) {
+                    moved += gaussians;
                     let before = chunk.motions.get(keyframe).copied().unwrap_or(Sim3::identity());
                     chunk.motions.insert(*keyframe, *new_from_old * before);
                     ball.transform(new_from_old);
@@ -227,6 +238,8 @@ impl Chunks {
             }
             chunk.ball = Ball::around_balls(&reached);
         }
+        self.index = self.state.index();
+        moved
     }
 
     /// Removes the Gaussians of keyframes; returns how many were away.
@@ -235,16 +248,14 @@ impl Chunks {
     /// If a chunk with Gaussians of others, too, cannot be read.
     pub fn remove(&mut self, keyframes: &BTreeSet<KeyframeId>, sh_degree: ShDegree) -> Result<usize, MappingError> {
         let before = self.gaussians_away();
-        let has_some = |(id, chunk): (&ChunkId, &Chunk)| (!chunk.keyframes.is_disjoint(keyframes)).then_some(*id);
+        let has_some = |(id, chunk): (&ChunkId, &Chunk)| chunk.keyframes.keys().any(|k| keyframes.contains(k)).then_some(*id);
         let affected: Vec<ChunkId> = self.state.away.iter().filter_map(has_some).collect();
         for id in affected {
             let chunk = &self.state.away[&id];
             let members = self.read(chunk, sh_degree)?;
             let stay: Vec<usize> = (0..chunk.gaussians).filter(|i| !keyframes.contains(&members.keyframes[*i])).collect();
             let round = chunk.round;
-            if let Some(chunk) = self.state.away.remove(&id) {
-                self.returned.push(Returned { id, chunk, in_snapshot: true, in_checkpoint: self.lasting });
-            }
+            self.forget(id);
             if !stay.is_empty() {
                 self.put(&members.picked(&stay), round);
             }
@@ -268,6 +279,12 @@ impl Chunks {
     /// All that are away.
     pub fn away(&self) -> BTreeSet<ChunkId> {
         self.state.away.keys().copied().collect()
+    }
+}
+
+impl ChunksState {
+    fn index(&self) -> Index {
+        self.away.iter().map(|(id, chunk)| (*id, &chunk.ball)).collect()
     }
 }
 

@@ -23,8 +23,8 @@ impl Mapper {
         }
         let moved = self.anchors.moved(&motions);
         self.cloud.transform(&self.gpu, &moved)?;
-        self.chunks.transform(&motions);
-        Ok(moved.iter().map(|motion| motion.run.len()).sum())
+        let away = if motions.is_empty() { 0 } else { self.chunks.transform(&motions) };
+        Ok(away + moved.iter().map(|motion| motion.run.len()).sum::<usize>())
     }
 
     /// Removes keyframes and the Gaussians inserted from them; returns how many Gaussians. Unknown ids are those that were never sent.

@@ -24,6 +24,7 @@ pub struct MapperState {
     anchors: Anchors,
     chunks: ChunksState,
     visits: Vec<u32>,
+    stepped_capacity: usize,
     keyframes: Vec<KeyframeState>,
     rng: u64,
     step_times: Vec<Duration>,
@@ -45,6 +46,7 @@ impl Mapper {
             anchors: self.anchors.clone(),
             chunks: self.chunks.state()?,
             visits: self.visits.clone(),
+            stepped_capacity: self.stepped_capacity,
             keyframes: self.keyframes.iter().map(|keyframe| keyframe.state(&self.gpu, &self.images)).collect::<Result<_, _>>()?,
             rng: self.rng.get_seed(),
             step_times: self.step_times.clone(),
@@ -78,6 +80,7 @@ impl Mapper {
         }
         mapper.anchors = state.anchors.clone();
         mapper.visits = state.visits.clone();
+        mapper.stepped_capacity = state.stepped_capacity;
         mapper.rng = Rng::with_seed(state.rng);
         mapper.step_times = state.step_times.clone();
         mapper.epoch = state.epoch.clone();

@@ -87,7 +87,7 @@ impl Mapper {
     /// How many of them its memory has room for, when there is to be room for one more keyframe's image.
     pub(super) fn most_on_gpu(&self) -> usize {
         let other =
-            LimitsConfig::other_bytes(self.gpu.bytes() + self.largest_image_bytes(), self.cloud.bytes(), self.cloud.capacity());
+            LimitsConfig::other_bytes(self.gpu.bytes() + self.largest_image_bytes(), self.cloud.bytes(), self.stepped_capacity);
         self.config.limits.gaussians_on_gpu(self.cloud.bytes_each(), other).min(self.cloud.most(&self.gpu))
     }
 

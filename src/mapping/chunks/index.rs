@@ -1,0 +1,99 @@
+//! Chunks by the cell of space that they lie in, so that what a view sees is found without a look at each.
+
+use std::collections::BTreeMap;
+
+use super::{Ball, ChunkId, Outlook};
+
+/// Side of a cell, metres. It decides how long a search takes, not what it finds.
+const CELL_METRES: f32 = 4.0;
+
+#[derive(Debug)]
+struct Cell {
+    /// Around the balls of all that came into it.
+    ball: Ball,
+    chunks: BTreeMap<ChunkId, Ball>,
+}
+
+/// All chunks that are away.
+#[derive(Debug, Default)]
+pub(super) struct Index {
+    cells: BTreeMap<[i32; 3], Cell>,
+}
+
+impl Index {
+    pub fn insert(&mut self, id: ChunkId, ball: Ball) {
+        let cell = self.cells.entry(cell_of(&ball)).or_insert_with(|| Cell { ball, chunks: BTreeMap::new() });
+        cell.ball = Ball::around_balls(&[cell.ball, ball]);
+        cell.chunks.insert(id, ball);
+    }
+
+    pub fn remove(&mut self, id: ChunkId, ball: &Ball) {
+        let key = cell_of(ball);
+        if let Some(cell) = self.cells.get_mut(&key) {
+            cell.chunks.remove(&id);
+            if cell.chunks.is_empty() {
+                self.cells.remove(&key);
+            }
+        }
+    }
+
+    /// Chunks that a view sees, in any order.
+    pub fn seen_by<'a>(&'a self, outlook: &'a Outlook<'_>) -> impl Iterator<Item = (ChunkId, &'a Ball)> {
+        let cells = self.cells.values().filter(|cell| outlook.sees(&cell.ball));
+        cells.flat_map(|cell| &cell.chunks).filter(|(_, ball)| outlook.sees(ball)).map(|(id, ball)| (*id, ball))
+    }
+}
+
+impl<'a> FromIterator<(ChunkId, &'a Ball)> for Index {
+    fn from_iter<T: IntoIterator<Item = (ChunkId, &'a Ball)>>(chunks: T) -> Self {
+        let mut index = Self::default();
+        chunks.into_iter().for_each(|(id, ball)| index.insert(id, *ball));
+        index
+    }
+}
+
+fn cell_of(ball: &Ball) -> [i32; 3] {
+    ball.center().to_array().map(|coordinate| (coordinate / CELL_METRES).floor() as i32)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use image::RgbImage;
+    use proptest::prelude::*;
+
+    use super::*;
+    use crate::geometry::{Pinhole, Se3};
+    use crate::mapping::chunks::Sight;
+    use crate::sequence::{DepthImage, RectifiedImage};
+    use crate::splat::ViewCamera;
+
+    proptest! {
+        #[test]
+        fn the_index_finds_what_a_look_at_each_finds(
+            balls in prop::collection::vec(prop::array::uniform4(-12.0f32..12.0), 1..80),
+            (x, turn, depth) in (-8.0f64..8.0, -3.0f64..3.0, 1.0f32..9.0),
+            removed in prop::collection::vec(any::<prop::sample::Index>(), 0..20),
+        ) {
+            let pinhole = Pinhole { fx: 32.0, fy: 32.0, cx: 15.5, cy: 11.5, width: 32, height: 24 };
+            let depth = DepthImage { width: 32, height: 24, metres: vec![depth; 32 * 24] };
+            let image = RectifiedImage { pinhole, color: RgbImage::new(32, 24), depth: Some(depth), valid: None };
+            let camera_from_world = Se3::new([x, 0.0, 0.5].into(), [0.0, turn, 0.0].into());
+            let sight = Sight::of(&image);
+            let outlook = sight.from(&ViewCamera { pinhole, camera_from_world });
+            let mut chunks: BTreeMap<ChunkId, Ball> =
+                (0..).zip(balls).map(|(id, [x, y, z, r])| (id, Ball([x, y, z, r.abs() / 8.0]))).collect();
+            let mut index: Index = chunks.iter().map(|(id, ball)| (*id, ball)).collect();
+            for which in removed {
+                let id = which.index(100) as ChunkId;
+                if let Some(ball) = chunks.remove(&id) {
+                    index.remove(id, &ball);
+                }
+            }
+            let found: BTreeSet<ChunkId> = index.seen_by(&outlook).map(|(id, _)| id).collect();
+            let expected: BTreeSet<ChunkId> = chunks.iter().filter(|(_, ball)| outlook.sees(ball)).map(|(id, _)| *id).collect();
+            prop_assert_eq!(found, expected);
+        }
+    }
+}

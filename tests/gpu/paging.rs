@@ -1,0 +1,202 @@
+//! Maps larger than the GPU's memory: what no keyframe of the window sees waits on the disk, and nothing is lost.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use fastrand::Rng;
+use image::{Rgb, RgbImage};
+use keysplat::geometry::{Pinhole, Se3};
+use keysplat::gpu::Gpu;
+use keysplat::mapping::{Keyframe, Mapper, MappingConfig, MappingError, PoseUpdate};
+use keysplat::render::{GpuCloud, MapRenderer, Plan};
+use keysplat::splat::model::Surface;
+use keysplat::splat::{GaussianCloud, ShDegree, ViewCamera};
+use nalgebra::Vector3;
+
+use crate::common::requirements::adapter;
+use crate::mapper::keyframe;
+
+const KEYFRAMES: usize = 40;
+
+fn config() -> MappingConfig {
+    let mut config = MappingConfig { first_iterations: 10, iterations_per_keyframe: 10, ..Default::default() };
+    config.insertion.flat_stride = config.insertion.stride;
+    config
+}
+
+/// A wall of another colour every five metres.
+fn elsewhere(id: usize) -> Keyframe {
+    let mut keyframe = Keyframe { world_from_camera: Se3::translation(5.0 * id as f64, 0.0, 0.0), ..keyframe(id, true) };
+    let shade = |pixel: &Rgb<u8>| Rgb([pixel.0[0], pixel.0[1], pixel.0[2] / 2 + (3 * id % 128) as u8]);
+    let image = &keyframe.image.color;
+    keyframe.image.color = RgbImage::from_fn(image.width(), image.height(), |x, y| shade(image.get_pixel(x, y)));
+    keyframe
+}
+
+fn walk(gpu: &Arc<Gpu>, config: &MappingConfig, file: Option<&Path>) -> Mapper {
+    let mut mapper = Mapper::new(gpu.clone(), config).unwrap().with_chunks(file.map(Into::into), false);
+    (0..KEYFRAMES).for_each(|id| drop(mapper.insert(&elsewhere(id), &|| false).unwrap()));
+    mapper
+}
+
+/// Bound to a part of the memory that the whole map takes.
+fn bounded(share: f64) -> Option<(Arc<Gpu>, MappingConfig, u64)> {
+    let free = adapter()?;
+    drop(walk(&free, &config(), None));
+    let limit = (share * free.peak_bytes() as f64) as u64;
+    let mut config = config();
+    config.limits.max_gpu_bytes = Some(limit);
+    Some((adapter()?, config, limit))
+}
+
+/// Mean absolute error of the map at each keyframe's view.
+fn errors(gpu: &Arc<Gpu>, map: &GaussianCloud) -> Vec<f32> {
+    let mut renderer = MapRenderer::new(gpu, map, Surface::Volume, usize::MAX).unwrap();
+    let error = |id| {
+        let (keyframe, rendered) = (elsewhere(id), renderer.render(&elsewhere(id).camera()).unwrap());
+        let pixels = keyframe.image.color.pixels().zip(&rendered.color_depth);
+        let sum: f32 = pixels.map(|(pixel, p)| (0..3).map(|k| (f32::from(pixel[k]) / 255.0 - p[k]).abs()).sum::<f32>() / 3.0).sum();
+        sum / rendered.color_depth.len() as f32
+    };
+    (0..KEYFRAMES).map(error).collect()
+}
+
+#[test]
+fn what_was_copied_out_comes_back_as_it_was() {
+    let Some(gpu) = adapter() else { return };
+    let rng = &mut Rng::with_seed(7);
+    let degree = ShDegree::new(2).unwrap();
+    let mut map = GpuCloud::new(&gpu, degree, 300).unwrap();
+    map.append(&gpu, &crate::common::scene(rng, 300, degree)).unwrap();
+    let elements = map.planes() * map.capacity();
+    let noise: Vec<[f32; 4]> = (0..elements).map(|_| [rng.f32(), rng.f32(), rng.f32(), rng.f32()]).collect();
+    [map.moments_1(), map.moments_2(), map.averages()].iter().for_each(|buffer| buffer.write(&gpu, 0, &noise));
+    let places: Vec<u32> = (0..300).filter(|place| place % 3 == 1).collect();
+    let rest: Vec<u32> = (0..300).filter(|place| place % 3 != 1).collect();
+    let (out, others) = (map.copy_out(&gpu, &places).unwrap(), map.copy_out(&gpu, &rest).unwrap());
+    assert_eq!((out.len(), others.len(), map.len()), (100, 200, 300));
+    map.apply(&gpu, &Plan::removing(places)).unwrap();
+    assert_eq!(map.copy_out(&gpu, &(0..200).collect::<Vec<_>>()).unwrap(), others);
+    map.put_back(&gpu, &out).unwrap();
+    assert_eq!(map.copy_out(&gpu, &(200..300).collect::<Vec<_>>()).unwrap(), out);
+    assert_eq!(map.copy_out(&gpu, &(0..200).collect::<Vec<_>>()).unwrap(), others);
+    let bytes = out.to_bytes();
+    assert_eq!(keysplat::render::CloudPart::from_bytes(&bytes, degree, 100), Some(out));
+    assert_eq!(keysplat::render::CloudPart::from_bytes(&bytes[1..], degree, 100), None);
+}
+
+#[test]
+fn memory_is_held_and_nothing_is_lost() {
+    let Some((gpu, config, limit)) = bounded(0.6) else { return };
+    let mut mapper = walk(&gpu, &config, None);
+    assert!(gpu.peak_bytes() <= limit, "{} of {limit} bytes", gpu.peak_bytes());
+    let (paging, resident) = (mapper.paging(), mapper.map().len());
+    assert!(resident < mapper.gaussians() * 2 / 3 && paging.most_away > 1000, "{resident} of {}, {paging:?}", mapper.gaussians());
+    let Some(free) = adapter() else { return };
+    let whole = walk(&free, &self::config(), None).download().unwrap();
+    let map = mapper.download().unwrap();
+    assert_eq!(map.len(), mapper.gaussians());
+    assert!(map.len() > whole.len() * 9 / 10, "{} of {}", map.len(), whole.len());
+    for (id, (paged, whole)) in errors(&free, &map).into_iter().zip(errors(&free, &whole)).enumerate() {
+        assert!(paged < 1.3 * whole + 0.005, "keyframe {id}: {paged} and {whole}");
+    }
+    // Who comes back finds what was there.
+    let again = Keyframe { id: KEYFRAMES, ..elsewhere(1) };
+    let report = mapper.insert(&again, &|| false).unwrap();
+    assert!(report.inserted < 100 && mapper.paging().gaussians_in > 100, "{report:?} {:?}", mapper.paging());
+    let mut refinement = mapper.begin_refinement().unwrap();
+    while mapper.refine(&mut refinement, &|| false).unwrap().is_some() {}
+    assert!(gpu.peak_bytes() <= limit, "{} of {limit} bytes", gpu.peak_bytes());
+    let refined = errors(&free, &mapper.download().unwrap());
+    let mean = |errors: &[f32]| errors.iter().sum::<f32>() / errors.len() as f32;
+    assert!(mean(&refined) < mean(&errors(&free, &map)), "{refined:?}");
+}
+
+/// Bindings are the limit of one adapter, memory that of the other. Neither ends the run.
+#[test]
+fn a_map_that_fills_the_adapter_goes_on_beside_it() {
+    const LARGEST: u64 = 4 << 20;
+    let Some(free) = adapter() else { return };
+    let whole = walk(&free, &config(), None).gaussians();
+    let small = Gpu::open_small(None, LARGEST).unwrap();
+    let poor = Gpu::open(None).unwrap();
+    poor.limit_memory(free.peak_bytes() * 7 / 10);
+    for gpu in [small, poor] {
+        let mapper = walk(&gpu, &config(), None);
+        assert!(mapper.gaussians() > whole * 9 / 10, "{} of {whole}", mapper.gaussians());
+        assert!(mapper.map().len() < mapper.gaussians(), "nothing left: {:?}", mapper.paging());
+        let errors = errors(&free, &mapper.download().unwrap());
+        assert!(errors.iter().all(|error| *error < 0.1), "{errors:?}");
+        // A resumed map knows the room that it has.
+        let state = mapper.state(None).unwrap();
+        assert!(mapper.map().len() as u64 * 16 <= gpu.max_storage_bytes() && state_is_kept(&state));
+    }
+}
+
+fn state_is_kept(state: &keysplat::mapping::MapperState) -> bool {
+    format!("{state:?}").contains("away")
+}
+
+#[test]
+fn what_is_away_follows_its_keyframes() {
+    let Some((gpu, config, _)) = bounded(0.6) else { return };
+    let mut mapper = walk(&gpu, &config, None);
+    let before = mapper.download().unwrap();
+    let shift = Vector3::new(0.0, 0.5, 0.0);
+    let update = |id| {
+        let mut world_from_camera = elsewhere(id).world_from_camera;
+        world_from_camera.translation.vector += shift;
+        PoseUpdate::rigid(id, world_from_camera)
+    };
+    let updates: Vec<PoseUpdate> = (0..KEYFRAMES).map(update).collect();
+    assert_eq!(mapper.update_poses(&updates).unwrap(), mapper.gaussians());
+    let after = mapper.download().unwrap();
+    let moved = before.means.iter().zip(&after.means).map(|(a, b)| *b - *a);
+    assert!(moved.into_iter().all(|moved| (moved.y - 0.5).abs() < 1e-4 && moved.x.abs() + moved.z.abs() < 1e-4));
+    assert_eq!(before.sh, after.sh);
+    // Half of the keyframes go, wherever their Gaussians are.
+    let gone: Vec<usize> = (0..KEYFRAMES / 2).collect();
+    let removed = mapper.remove_keyframes(&gone).unwrap();
+    let rest = mapper.download().unwrap();
+    assert_eq!(rest.len() + removed, after.len());
+    assert!(rest.means.iter().all(|mean| mean.x > 5.0 * (KEYFRAMES / 2) as f32 - 3.5), "{removed} of {}", after.len());
+}
+
+#[test]
+fn a_damaged_file_is_named_and_a_file_of_an_earlier_run_goes() {
+    let Some((gpu, config, _)) = bounded(0.6) else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("chunks.bin");
+    std::fs::write(&file, b"of an earlier run").unwrap();
+    let mut mapper = walk(&gpu, &config, Some(&file));
+    let bytes = std::fs::read(&file).unwrap();
+    assert!(bytes.len() > 100_000);
+    std::fs::write(&file, vec![0; bytes.len()]).unwrap();
+    let error = mapper.insert(&Keyframe { id: KEYFRAMES, ..elsewhere(1) }, &|| false).unwrap_err();
+    assert!(matches!(&error, MappingError::Chunks { path, .. } if *path == file), "{error}");
+    assert!(error.to_string().contains("has changed since it was written"), "{error}");
+}
+
+#[test]
+fn slabs_show_what_the_whole_map_shows() {
+    let Some(gpu) = adapter() else { return };
+    let rng = &mut Rng::with_seed(11);
+    for degree in [0, 2] {
+        let map = crate::common::scene(rng, 900, ShDegree::new(degree).unwrap());
+        let pinhole = Pinhole { fx: 60.0, fy: 60.0, cx: 31.5, cy: 23.5, width: 64, height: 48 };
+        for surface in [Surface::Volume, Surface::Planar] {
+            let mut whole = MapRenderer::new(&gpu, &map, surface, usize::MAX).unwrap();
+            let mut slabs = MapRenderer::new(&gpu, &map, surface, 130).unwrap();
+            for turn in [0.0, 0.4, -0.7] {
+                let camera_from_world = Se3::new(Vector3::new(0.0, 0.0, 0.3), Vector3::new(0.0, turn, 0.0));
+                let camera = ViewCamera { pinhole, camera_from_world };
+                let (a, b) = (whole.render(&camera).unwrap(), slabs.render(&camera).unwrap());
+                let pixels = a.color_depth.iter().zip(&b.color_depth);
+                let worst = pixels.map(|(a, b)| (0..3).map(|k| (a[k] - b[k]).abs()).fold(0.0, f32::max)).fold(0.0, f32::max);
+                let light = a.transmittance.iter().zip(&b.transmittance).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+                assert!(worst < 0.01 && light < 0.01, "degree {degree}, {surface:?}, {turn}: {worst} {light}");
+                assert!(a.transmittance.iter().any(|light| *light < 0.5), "there is something to see");
+            }
+        }
+    }
+}
