@@ -1,0 +1,1 @@
+//! Merging keeps mass and moments, and files hold what they name.
