@@ -88,11 +88,11 @@ impl Bound {
 }
 
 /// What viewers load at once: cells of a level, side by side.
-struct Piece {
-    level: usize,
+pub(super) struct Piece {
+    pub level: usize,
     /// Number among the pieces of its level.
-    number: usize,
-    cells: Vec<usize>,
+    pub number: usize,
+    pub cells: Vec<usize>,
 }
 
 impl Piece {
@@ -147,7 +147,7 @@ impl Levels {
         Ok(bytes + meta.len() as u64)
     }
 
-    fn pieces(&self) -> Vec<Piece> {
+    pub(super) fn pieces(&self) -> Vec<Piece> {
         let mut pieces: Vec<Piece> = Vec::new();
         for (level, cells) in self.levels.iter().enumerate() {
             let (mut number, mut held) = (0, 0);
