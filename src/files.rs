@@ -19,6 +19,7 @@ fn advice(kind: ErrorKind) -> &'static str {
         ErrorKind::PermissionDenied | ErrorKind::ReadOnlyFilesystem => "choose a folder that you may write to",
         ErrorKind::NotFound | ErrorKind::NotADirectory => "create the folder first",
         ErrorKind::IsADirectory => "a folder has that name: remove it or choose another name",
+        ErrorKind::DirectoryNotEmpty => "choose a new folder, or empty it",
         _ => "check the disk and the path",
     }
 }

@@ -1,4 +1,4 @@
-//! `keysplat export`: a map in another file format, whole or in part; a run's images and poses for other programs.
+//! `keysplat export`: a map in another file format or in levels of detail, whole or in part; a run's images and poses for other programs.
 
 mod target;
 
@@ -7,12 +7,13 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use glam::Vec3;
 use keysplat::export::dataset::DatasetFormat;
+use keysplat::export::lod::{DISTANCE_FACTOR, Levels};
 use keysplat::export::{ExportFilter, MapFormat};
 use keysplat::files::write_atomically;
 use keysplat::geometry::{Se3, Trajectory};
 use keysplat::run_folder::outputs;
 use keysplat::session::{DatasetCounts, DatasetOptions, DatasetViews, export_dataset};
-use keysplat::splat::ShDegree;
+use keysplat::splat::{GaussianCloud, ShDegree};
 use miette::{IntoDiagnostic, miette};
 use target::Target;
 
@@ -22,11 +23,14 @@ use super::{Verbosity, print, progress};
 pub struct ExportArgs {
     /// Folder of a run, or, for a map in another format, a map.
     map: PathBuf,
-    /// File to write; its ending is the format: .ply, .spz, .sog or .glb. For a dataset, a new folder.
+    /// File to write; its ending is the format: .ply, .spz, .sog or .glb. For a dataset or levels of detail, a new folder.
     out: PathBuf,
     /// Format, where the ending does not say it.
     #[arg(long, value_enum)]
     format: Option<Target>,
+    /// Levels of detail in a folder; the same as --format lod.
+    #[arg(long, conflicts_with = "format")]
+    lod: bool,
     /// Images of a dataset.
     #[arg(long, value_enum, default_value_t = DatasetViews::Keyframes)]
     views: DatasetViews,
@@ -94,16 +98,28 @@ fn cameras(path: &Path) -> Vec<Se3> {
 }
 
 pub fn export(args: &ExportArgs, verbosity: Verbosity) -> miette::Result<()> {
-    let to = args.format.or_else(|| Target::of_path(&args.out));
+    let named = if args.lod { Some(Target::Levels) } else { args.format };
+    let to = named.or_else(|| Target::of_path(&args.out));
     let unknown = || {
         miette!("{} does not say its format; end it in .ply, .spz, .sog or .glb, or name one with --format", args.out.display())
     };
     let done = match to.ok_or_else(unknown)? {
         Target::Map(format) => export_map(args, format)?,
+        Target::Levels => export_levels(args)?,
         Target::Dataset(format) => export_images(args, format, verbosity)?,
         Target::Kitti => export_poses(args)?,
     };
     if verbosity.quiet { Ok(()) } else { print(&format!("{done}\n")) }
+}
+
+/// What the filters leave of a map.
+fn read_part(args: &ExportArgs, path: &Path, format: MapFormat) -> miette::Result<GaussianCloud> {
+    let cloud = format.read(path).into_diagnostic()?;
+    let part = args.filter().apply(&cloud);
+    if part.is_empty() {
+        return Err(miette!("of {} Gaussians, none passes; widen --crop or lower --min-opacity", cloud.len()));
+    }
+    Ok(part)
 }
 
 fn export_map(args: &ExportArgs, to: MapFormat) -> miette::Result<String> {
@@ -112,11 +128,7 @@ fn export_map(args: &ExportArgs, to: MapFormat) -> miette::Result<String> {
     if same(&args.out).is_some_and(|out| Some(out) == same(&path)) {
         return Err(miette!("{} is the map that is exported; choose another file", path.display()));
     }
-    let cloud = from.read(&path).into_diagnostic()?;
-    let part = args.filter().apply(&cloud);
-    if part.is_empty() {
-        return Err(miette!("of {} Gaussians, none passes; widen --crop or lower --min-opacity", cloud.len()));
-    }
+    let part = read_part(args, &path, from)?;
     if part.antialiased && !to.keeps_antialiasing() {
         tracing::warn!(
             "{} has no place for antialiasing: viewers will draw small Gaussians too opaque; .ply, .spz and .sog keep it",
@@ -127,11 +139,32 @@ fn export_map(args: &ExportArgs, to: MapFormat) -> miette::Result<String> {
     Ok(format!("{}: {} Gaussians, {:.1} MiB", args.out.display(), part.len(), bytes as f64 / f64::from(1 << 20)))
 }
 
+/// The folder to write, which may be named by its main file.
+fn folder_of(out: &Path, target: Target) -> &Path {
+    let folder = if Target::of_path(out) == Some(target) { out.parent().unwrap_or(Path::new("")) } else { out };
+    if folder.as_os_str().is_empty() { Path::new(".") } else { folder }
+}
+
+/// The map in levels of detail; `lod-meta.json` may be named instead of its folder.
+fn export_levels(args: &ExportArgs) -> miette::Result<String> {
+    if MapFormat::of_path(&args.out).is_some() {
+        return Err(miette!("{} names a file; levels of detail are a folder: leave out the ending", args.out.display()));
+    }
+    let folder = folder_of(&args.out, Target::Levels);
+    let (path, from) = find(&args.map)?;
+    let levels = Levels::new(&read_part(args, &path, from)?);
+    let bytes = levels.write(&cameras(&args.map), folder).into_diagnostic()?;
+    let counts: Vec<String> = levels.counts().iter().map(usize::to_string).collect();
+    let advice = levels
+        .base_distance()
+        .map_or(String::new(), |metres| format!("; for viewers: lodBaseDistance {metres:.1}, lodMultiplier {DISTANCE_FACTOR}"));
+    let size = bytes as f64 / f64::from(1 << 20);
+    Ok(format!("{}: {} Gaussians by level, {size:.1} MiB{advice}", folder.display(), counts.join(", ")))
+}
+
 /// A dataset of the run's images; `transforms.json` may be named instead of its folder.
 fn export_images(args: &ExportArgs, format: DatasetFormat, verbosity: Verbosity) -> miette::Result<String> {
-    let is_named = format == DatasetFormat::Transforms && Target::of_path(&args.out) == Some(Target::Dataset(format));
-    let folder = if is_named { args.out.parent().unwrap_or(Path::new("")) } else { &args.out };
-    let folder = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
+    let folder = folder_of(&args.out, Target::Dataset(format));
     let options = DatasetOptions { format, views: args.views, points: args.filter(), sequence: args.sequence.clone() };
     let bar = progress::spinner(verbosity, "{spinner} {pos} images");
     let counts = export_dataset(&args.map, folder, &options, &|images| bar.set_position(images as u64));

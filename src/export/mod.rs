@@ -7,6 +7,7 @@ pub mod dataset;
 mod filter;
 mod glb;
 mod harmonics;
+pub mod lod;
 mod ply;
 mod sog;
 mod splat;

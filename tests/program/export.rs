@@ -1,10 +1,12 @@
 //! `keysplat export`: a map in all formats, whole and in part.
 
+use std::io::{Cursor, Write};
 use std::path::Path;
 
 use glam::Vec3;
 use keysplat::export::MapFormat;
 use keysplat::splat::{GaussianCloud, ShDegree};
+use serde_json::{Value, json};
 
 use crate::common::recording::{Finished, finish, keysplat, scratch};
 
@@ -67,4 +69,65 @@ fn what_cannot_be_exported_is_refused() {
     std::fs::write(&out, b"\x1f\x8b and no more").unwrap();
     export(&out, &scratch().join("y.ply"), &[]).refused(&["x.spz", "this is no SPZ file"]);
     assert!(!scratch().join("y.ply").exists());
+}
+
+/// A piece of a streamed map, as the SOG reader takes it: its files in a zip.
+fn piece(meta: &Path) -> GaussianCloud {
+    let mut zip = zip::ZipWriter::new(Cursor::new(Vec::new()));
+    for entry in std::fs::read_dir(meta.parent().unwrap()).unwrap() {
+        let path = entry.unwrap().path();
+        zip.start_file(path.file_name().unwrap().to_str().unwrap(), zip::write::SimpleFileOptions::default()).unwrap();
+        zip.write_all(&std::fs::read(&path).unwrap()).unwrap();
+    }
+    MapFormat::by_name("sog").unwrap().decode(&zip.finish().unwrap().into_inner()).unwrap()
+}
+
+/// The leaves of a streamed map's tree.
+fn leaves(node: &Value) -> Vec<&Value> {
+    match node["children"].as_array() {
+        Some(children) => children.iter().flat_map(leaves).collect(),
+        None => vec![node],
+    }
+}
+
+#[test]
+fn levels_of_detail_hold_what_they_name() {
+    let map = crate::common::scene(&mut fastrand::Rng::with_seed(4), 9000, ShDegree::new(1).unwrap());
+    let ply = scratch().join("lod.ply");
+    MapFormat::default().write(&map, &ply).unwrap();
+    let out = scratch().join("levels");
+    let said = export(&ply, &out, &["--lod"]).succeeded();
+    assert!(said.stdout.contains("9000, 2250 Gaussians by level") && said.stdout.contains("lodBaseDistance"), "{}", said.stdout);
+    let meta: Value = serde_json::from_slice(&std::fs::read(out.join("lod-meta.json")).unwrap()).unwrap();
+    assert_eq!((&meta["version"], &meta["lodLevels"], &meta["count"]), (&json!(1), &json!(2), &json!(11250)));
+    assert_eq!(meta["counts"], json!([9000, 2250]));
+    let names = meta["filenames"].as_array().unwrap().iter().map(|name| name.as_str().unwrap());
+    let pieces: Vec<GaussianCloud> = names.map(|name| piece(&out.join(name))).collect();
+    let mut read = vec![0; pieces.len()];
+    for leaf in leaves(&meta["tree"]) {
+        let corner = |name: &str| Vec3::from([0, 1, 2].map(|k| leaf["bound"][name][k].as_f64().unwrap() as f32));
+        for level in ["0", "1"] {
+            let number = |name: &str| leaf["lods"][level][name].as_u64().unwrap() as usize;
+            let (file, offset, count) = (number("file"), number("offset"), number("count"));
+            assert_eq!(offset, read[file], "cells follow each other");
+            assert!(count > 0 && count <= 4096);
+            read[file] += count;
+            let inside = |mean: &Vec3| mean.cmpge(corner("min")).all() && mean.cmple(corner("max")).all();
+            assert!(pieces[file].means[offset..offset + count].iter().all(inside));
+        }
+    }
+    assert_eq!(read, pieces.iter().map(GaussianCloud::len).collect::<Vec<_>>());
+    // Level 0 is the map.
+    let tolerance = MapFormat::by_name("sog").unwrap().tolerance();
+    for mean in &pieces[0].means {
+        let nearest = map.means.iter().map(|other| mean.distance(*other)).min_by(f32::total_cmp).unwrap();
+        assert!(nearest < tolerance / 50.0, "{nearest}");
+    }
+    assert_eq!((pieces[0].sh_degree, pieces[0].len()), (map.sh_degree, map.len()));
+    export(&ply, &out, &["--lod"]).refused(&["levels", "choose a new folder, or empty it"]);
+    export(&ply, &scratch().join("levels.sog"), &["--lod"]).refused(&["levels.sog names a file", "leave out the ending"]);
+    let few = scratch().join("few/lod-meta.json");
+    export(&ply, &few, &["--max-gaussians", "50", "--sh-degree", "0"]).succeeded();
+    let meta: Value = serde_json::from_slice(&std::fs::read(&few).unwrap()).unwrap();
+    assert_eq!(meta["counts"], json!([50]));
 }

@@ -37,7 +37,7 @@ impl Plane {
     }
 
     /// The smaller of the crate's two ways to code it.
-    fn encode(&self) -> Result<Vec<u8>, String> {
+    pub fn encode(&self) -> Result<Vec<u8>, String> {
         let opaque = self.pixels.iter().all(|pixel| pixel[3] == 255);
         let (color, channels) = if opaque { (ColorType::Rgb8, 3) } else { (ColorType::Rgba8, 4) };
         let bytes: Vec<u8> = self.pixels.iter().flat_map(|pixel| &pixel[..channels]).copied().collect();
@@ -81,6 +81,7 @@ impl Writer {
         self.0.write_all(bytes).map_err(|error| error.to_string())
     }
 
+    #[cfg(test)]
     pub fn add_plane(&mut self, name: &str, plane: &Plane) -> Result<(), String> {
         self.add(name, &plane.encode()?)
     }

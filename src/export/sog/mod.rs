@@ -2,7 +2,7 @@
 //! Gaussian, and `meta.json`.
 //!
 //! Positions have 16 bits after a logarithm, rotations eight a component, sizes and colours the places in a codebook. Harmonics beyond the
-//! constant one have labels into a palette. Left out: version 1, folders instead of zips, and levels of detail.
+//! constant one have labels into a palette. Streamed maps have the same images in folders; those are only written. Left out: version 1.
 
 mod bundle;
 mod codebook;
@@ -14,7 +14,11 @@ mod write;
 
 use serde::{Deserialize, Serialize};
 
-use super::FormatRow;
+pub(super) use morton::order;
+
+use super::{ExportError, FormatRow};
+use crate::geometry::Se3;
+use crate::splat::GaussianCloud;
 
 /// The format's row in the table of formats.
 pub(super) const FORMAT: FormatRow = FormatRow {
@@ -36,6 +40,17 @@ pub(super) const COMPACT_FORMAT: FormatRow = FormatRow {
     encode: Some(|cloud, cameras| write::encode(cloud, cameras, &COMPACT)),
     ..FORMAT
 };
+
+/// A file of a map in a folder instead of a zip.
+pub(super) struct SogFile {
+    pub name: &'static str,
+    pub bytes: Vec<u8>,
+}
+
+/// The images of a map and, last, their description, for cameras at these poses, world from camera. Gaussians keep their order.
+pub(super) fn files(cloud: GaussianCloud, cameras: &[Se3]) -> Result<Vec<SogFile>, ExportError> {
+    write::encode_files(cloud, cameras, &FINE)
+}
 
 /// How closely a file holds a map. Values that are stored alike compress well.
 struct Precision {
@@ -76,7 +91,7 @@ const COMPACT: Precision = Precision {
 };
 
 const VERSION: u32 = 2;
-const META: &str = "meta.json";
+pub(super) const META: &str = "meta.json";
 /// Entries of the palette side by side in its image.
 const ENTRIES_A_ROW: usize = 64;
 /// The byte of a rotation whose largest component is w; x, y and z follow.

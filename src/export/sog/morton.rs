@@ -6,7 +6,7 @@ use glam::{DVec3, Vec3};
 const BITS: u32 = 21;
 
 /// Indices of the points along the curve; points that share a cell keep their order.
-pub(super) fn order(points: &[Vec3]) -> Vec<usize> {
+pub(in crate::export) fn order(points: &[Vec3]) -> Vec<usize> {
     let low = points.iter().fold(DVec3::INFINITY, |low, p| low.min(p.as_dvec3()));
     let high = points.iter().fold(DVec3::NEG_INFINITY, |high, p| high.max(p.as_dvec3()));
     let size = (high - low).max_element().max(f64::MIN_POSITIVE);

@@ -6,7 +6,9 @@ use rayon::prelude::*;
 use super::bundle::{Plane, Writer};
 use super::codebook::Codebook;
 use super::palette::Palette as Found;
-use super::{Coded, ENTRIES_A_ROW, Files, LARGEST, META, MOST_CODE, Means, Meta, Palette, Precision, VERSION, compressed};
+use super::{
+    Coded, ENTRIES_A_ROW, Files, LARGEST, META, MOST_CODE, Means, Meta, Palette, Precision, SogFile, VERSION, compressed,
+};
 use crate::export::ExportError;
 use crate::export::harmonics::{Seen, channel};
 use crate::geometry::Se3;
@@ -19,36 +21,56 @@ const MOST_HARMONIC: f32 = 1e4;
 
 /// The whole file, for cameras at these poses (world from camera), which may be none.
 pub(super) fn encode(cloud: &GaussianCloud, cameras: &[Se3], precision: &Precision) -> Result<Vec<u8>, ExportError> {
+    check(cloud)?;
+    let mut sorted = cloud.emptied();
+    super::morton::image_order(&cloud.means, Plane::width(cloud.len())).into_iter().for_each(|i| sorted.push(cloud.get(i)));
+    let files = encode_files(sorted, cameras, precision)?;
+    bundle(&files).map_err(|reason| ExportError::Encode { reason })
+}
+
+/// The images and the description, which is the last, of a map in its order.
+pub(super) fn encode_files(cloud: GaussianCloud, cameras: &[Se3], precision: &Precision) -> Result<Vec<SogFile>, ExportError> {
+    check(&cloud)?;
+    files(cloud, cameras, precision).map_err(|reason| ExportError::Encode { reason })
+}
+
+fn check(cloud: &GaussianCloud) -> Result<(), ExportError> {
     if let Some(index) = cloud.first_non_finite() {
         return Err(ExportError::NonFinite { index });
     }
     if cloud.len() > MOST_GAUSSIANS {
         return Err(ExportError::Encode { reason: format!("SOG holds {MOST_GAUSSIANS} Gaussians at most") });
     }
-    let mut sorted = cloud.emptied();
-    super::morton::image_order(&cloud.means, Plane::width(cloud.len())).into_iter().for_each(|i| sorted.push(cloud.get(i)));
-    bundle(sorted, cameras, precision).map_err(|reason| ExportError::Encode { reason })
+    Ok(())
 }
 
-fn bundle(mut cloud: GaussianCloud, cameras: &[Se3], precision: &Precision) -> Result<Vec<u8>, String> {
-    cloud.sh.iter_mut().for_each(|c| *c = c.clamp(Vec3::splat(-MOST_HARMONIC), Vec3::splat(MOST_HARMONIC)));
+fn bundle(files: &[SogFile]) -> Result<Vec<u8>, String> {
     let mut zip = Writer::new();
+    for SogFile { name, bytes } in files {
+        if *name == META { zip.add_deflated(name, bytes)? } else { zip.add(name, bytes)? }
+    }
+    zip.finish()
+}
+
+fn files(mut cloud: GaussianCloud, cameras: &[Se3], precision: &Precision) -> Result<Vec<SogFile>, String> {
+    cloud.sh.iter_mut().for_each(|c| *c = c.clamp(Vec3::splat(-MOST_HARMONIC), Vec3::splat(MOST_HARMONIC)));
+    let mut images = Vec::new();
     let has_harmonics = cloud.sh_degree.get() > 0;
-    let harmonics = if has_harmonics { Some(write_harmonics(&mut zip, &mut cloud, cameras, precision)?) } else { None };
+    let harmonics = if has_harmonics { Some(add_harmonics(&mut images, &mut cloud, cameras, precision)?) } else { None };
     let count = cloud.len();
-    let means = write_means(&mut zip, &cloud, precision.position_step)?;
-    zip.add_plane("quats.webp", &Plane::of(count, |i| smallest_three(cloud.rotations[i], precision.rotation_step)))?;
+    let means = add_means(&mut images, &cloud, precision.position_step)?;
+    add(&mut images, "quats.webp", &Plane::of(count, |i| smallest_three(cloud.rotations[i], precision.rotation_step)))?;
     let scales = Codebook::new(cloud.log_scales.iter().flat_map(|scale| scale.to_array()), precision.scale_step);
     let coded = |codebook: &Codebook, values: Vec3, last: u8| {
         let [r, g, b] = values.to_array().map(|value| codebook.place(value));
         [r, g, b, last]
     };
-    zip.add_plane("scales.webp", &Plane::of(count, |i| coded(&scales, cloud.log_scales[i], 255)))?;
+    add(&mut images, "scales.webp", &Plane::of(count, |i| coded(&scales, cloud.log_scales[i], 255)))?;
     let coefficients = cloud.sh_degree.coefficients();
     let constants: Vec<Vec3> = cloud.sh.chunks(coefficients).map(|sh| sh[0]).collect();
     let colors = Codebook::new(constants.iter().flat_map(|constant| constant.to_array()), precision.constant_step);
     let opacity = |i: usize| (opacity_from_raw(cloud.raw_opacities[i]) * 255.0).round() as u8;
-    zip.add_plane("sh0.webp", &Plane::of(count, |i| coded(&colors, constants[i], opacity(i))))?;
+    add(&mut images, "sh0.webp", &Plane::of(count, |i| coded(&colors, constants[i], opacity(i))))?;
     let meta = Meta {
         version: VERSION,
         count: count as u64,
@@ -59,8 +81,13 @@ fn bundle(mut cloud: GaussianCloud, cameras: &[Se3], precision: &Precision) -> R
         sh0: Coded { codebook: colors.0, files: ["sh0.webp".into()] },
         harmonics,
     };
-    zip.add_deflated(META, &serde_json::to_vec(&meta).map_err(|error| error.to_string())?)?;
-    zip.finish()
+    images.push(SogFile { name: META, bytes: serde_json::to_vec(&meta).map_err(|error| error.to_string())? });
+    Ok(images)
+}
+
+fn add(images: &mut Vec<SogFile>, name: &'static str, plane: &Plane) -> Result<(), String> {
+    images.push(SogFile { name, bytes: plane.encode()? });
+    Ok(())
 }
 
 /// Median of the Gaussians' least extents, metres.
@@ -70,7 +97,7 @@ fn median_extent(cloud: &GaussianCloud) -> f64 {
     if least.is_empty() { 0.0 } else { f64::from(*least.select_nth_unstable_by(middle, f32::total_cmp).1).exp() }
 }
 
-fn write_means(zip: &mut Writer, cloud: &GaussianCloud, position_step: f64) -> Result<Means, String> {
+fn add_means(images: &mut Vec<SogFile>, cloud: &GaussianCloud, position_step: f64) -> Result<Means, String> {
     let means = &cloud.means;
     let logs: Vec<[f64; 3]> = means.iter().map(|mean| mean.to_array().map(|v| compressed(f64::from(v)))).collect();
     let bound = |k: usize, pick: fn(f64, f64) -> f64| logs.iter().map(|log| log[k]).reduce(pick).unwrap_or(0.0);
@@ -92,8 +119,8 @@ fn write_means(zip: &mut Writer, cloud: &GaussianCloud, position_step: f64) -> R
             [x, y, z, 255]
         })
     };
-    zip.add_plane("means_l.webp", &half(0))?;
-    zip.add_plane("means_u.webp", &half(8))?;
+    add(images, "means_l.webp", &half(0))?;
+    add(images, "means_u.webp", &half(8))?;
     Ok(Means { mins, maxs, files: ["means_l.webp".into(), "means_u.webp".into()] })
 }
 
@@ -111,9 +138,9 @@ fn smallest_three(rotation: Quat, step: u8) -> [u8; 4] {
     bytes
 }
 
-/// Writes the palette and its labels. The constant harmonics then make up for what the palette changes in the cameras' views.
-fn write_harmonics(
-    zip: &mut Writer,
+/// Adds the palette and its labels. The constant harmonics then make up for what the palette changes in the cameras' views.
+fn add_harmonics(
+    images: &mut Vec<SogFile>,
     cloud: &mut GaussianCloud,
     cameras: &[Se3],
     precision: &Precision,
@@ -138,13 +165,13 @@ fn write_harmonics(
     let pixels = entries.chunks(3).map(|rgb| [codebook.place(rgb[0]), codebook.place(rgb[1]), codebook.place(rgb[2]), 255]);
     let mut pixels: Vec<[u8; 4]> = pixels.collect();
     pixels.resize(width * height, [0, 0, 0, 255]);
-    zip.add_plane("shN_centroids.webp", &Plane { width, height, pixels })?;
+    add(images, "shN_centroids.webp", &Plane { width, height, pixels })?;
     let label = |i: usize| {
         let [low, high] = found.labels[i].to_le_bytes();
         // Blue is not read; equal to green it costs nothing.
         [low, high, high, 255]
     };
-    zip.add_plane("shN_labels.webp", &Plane::of(cloud.len(), label))?;
+    add(images, "shN_labels.webp", &Plane::of(cloud.len(), label))?;
     let files = ["shN_centroids.webp".into(), "shN_labels.webp".into()];
     Ok(Palette { count, bands: cloud.sh_degree.get(), codebook: codebook.0, files })
 }
