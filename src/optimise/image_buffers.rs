@@ -41,13 +41,21 @@ impl ImageBuffers {
 
     /// Uploads the pixels of an offloaded target, before the next submission.
     pub fn stream(&mut self, gpu: &Gpu, pixels: &Pixels) -> Result<(), GpuError> {
-        let streamed = match self.streamed.take() {
-            Some(streamed) => streamed,
-            None => GpuPixels::blank(gpu, self.size)?,
-        };
-        streamed.write(gpu, pixels);
-        self.streamed = Some(streamed);
+        self.prepare_to_stream(gpu)?.write(gpu, pixels);
         Ok(())
+    }
+
+    /// Makes the buffer for offloaded targets.
+    pub fn prepare_to_stream(&mut self, gpu: &Gpu) -> Result<&GpuPixels, GpuError> {
+        Ok(match &mut self.streamed {
+            Some(streamed) => streamed,
+            none => none.insert(GpuPixels::blank(gpu, self.size)?),
+        })
+    }
+
+    /// Whether a target has been streamed.
+    pub fn streams(&self) -> bool {
+        self.streamed.is_some()
     }
 
     /// The pixels of a step's target: its own, or those that were streamed.

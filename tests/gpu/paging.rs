@@ -35,7 +35,7 @@ fn elsewhere(id: usize) -> Keyframe {
 
 fn walk(gpu: &Arc<Gpu>, config: &MappingConfig, file: Option<&Path>) -> Mapper {
     let mut mapper = Mapper::new(gpu.clone(), config).unwrap().with_chunks(file.map(Into::into), false);
-    (0..KEYFRAMES).for_each(|id| drop(mapper.insert(&elsewhere(id), &|| false).unwrap()));
+    (0..KEYFRAMES).for_each(|id| assert_eq!(mapper.insert(&elsewhere(id), &|| false).unwrap().id, id));
     mapper
 }
 
@@ -115,26 +115,22 @@ fn memory_is_held_and_nothing_is_lost() {
 /// Bindings are the limit of one adapter, memory that of the other. Neither ends the run.
 #[test]
 fn a_map_that_fills_the_adapter_goes_on_beside_it() {
-    const LARGEST: u64 = 4 << 20;
+    const LARGEST: u64 = 8 << 20;
     let Some(free) = adapter() else { return };
-    let whole = walk(&free, &config(), None).gaussians();
+    let mut config = config();
+    config.sh_degree = ShDegree::new(3).unwrap();
+    (config.insertion.stride, config.insertion.flat_stride) = (1, 1);
+    let whole = walk(&free, &config, None).gaussians();
     let small = Gpu::open_small(None, LARGEST).unwrap();
     let poor = Gpu::open(None).unwrap();
     poor.limit_memory(free.peak_bytes() * 7 / 10);
     for gpu in [small, poor] {
-        let mapper = walk(&gpu, &config(), None);
+        let mapper = walk(&gpu, &config, None);
         assert!(mapper.gaussians() > whole * 9 / 10, "{} of {whole}", mapper.gaussians());
-        assert!(mapper.map().len() < mapper.gaussians(), "nothing left: {:?}", mapper.paging());
+        assert!(mapper.map().len() < mapper.gaussians() * 3 / 4, "{} {:?}", mapper.map().len(), mapper.paging());
         let errors = errors(&free, &mapper.download().unwrap());
         assert!(errors.iter().all(|error| *error < 0.1), "{errors:?}");
-        // A resumed map knows the room that it has.
-        let state = mapper.state(None).unwrap();
-        assert!(mapper.map().len() as u64 * 16 <= gpu.max_storage_bytes() && state_is_kept(&state));
     }
-}
-
-fn state_is_kept(state: &keysplat::mapping::MapperState) -> bool {
-    format!("{state:?}").contains("away")
 }
 
 #[test]
@@ -153,7 +149,7 @@ fn what_is_away_follows_its_keyframes() {
     let after = mapper.download().unwrap();
     let moved = before.means.iter().zip(&after.means).map(|(a, b)| *b - *a);
     assert!(moved.into_iter().all(|moved| (moved.y - 0.5).abs() < 1e-4 && moved.x.abs() + moved.z.abs() < 1e-4));
-    assert_eq!(before.sh, after.sh);
+    assert!(before.sh.iter().zip(&after.sh).all(|(a, b)| a.distance(*b) < 1e-5));
     // Half of the keyframes go, wherever their Gaussians are.
     let gone: Vec<usize> = (0..KEYFRAMES / 2).collect();
     let removed = mapper.remove_keyframes(&gone).unwrap();

@@ -12,8 +12,8 @@ use crate::render::Capacities;
 pub struct TrainerState {
     /// Steps submitted so far: seeds the draws of tiles, and says when harmonics move.
     steps: usize,
-    /// Width and height of the views that there are buffers for, the latest first.
-    sizes: Vec<(u32, u32)>,
+    /// Width and height of the views that there are buffers for, the latest first, and whether targets were streamed to them.
+    sizes: Vec<((u32, u32), bool)>,
     /// Gaussians that there is room for among the scores.
     scored: usize,
     /// Cells that there is room for in a survey.
@@ -33,7 +33,7 @@ impl Trainer {
     pub fn state(&self) -> TrainerState {
         TrainerState {
             steps: self.steps,
-            sizes: self.images.iter().map(|images| images.size).collect(),
+            sizes: self.images.iter().map(|images| (images.size, images.streams())).collect(),
             scored: self.scores.capacity(),
             surveyed: self.survey.capacity(),
             rasterizer: self.rasterizer.capacities(),
@@ -48,8 +48,11 @@ impl Trainer {
         let gpu = &self.rasterizer.gpu().clone();
         self.rasterizer.reserve(state.rasterizer)?;
         self.steps = state.steps;
-        for size in state.sizes.iter().rev() {
+        for (size, streams) in state.sizes.iter().rev() {
             self.choose_images(*size)?;
+            if *streams {
+                self.images[0].prepare_to_stream(gpu)?;
+            }
         }
         self.survey.reserve(gpu, state.surveyed)?;
         if state.scored > 0 { self.scores.reserve(gpu, state.scored) } else { Ok(()) }
