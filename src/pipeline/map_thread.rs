@@ -15,7 +15,9 @@ use super::refining::{Checkpoints, KeptMapper, Refining, Round, figures, step_ms
 use super::{PipelineError, Progress};
 use crate::evaluation::machine;
 use crate::gpu::Gpu;
-use crate::mapping::{FinalRefinement, Interlude, KeyframeReport, Mapper, MapperMessage, MappingConfig, MappingError, PagedOut, PagingFigures};
+use crate::mapping::{
+    FinalRefinement, Interlude, KeyframeReport, Mapper, MapperMessage, MappingConfig, MappingError, PagedOut, PagingFigures,
+};
 use crate::run_folder::{CheckpointError, Checkpointer, KeyframeRecord, RunState};
 use crate::splat::GaussianCloud;
 

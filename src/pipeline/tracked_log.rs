@@ -106,7 +106,8 @@ impl<'a> TrackedLog<'a> {
             paused += reached.elapsed();
         };
         let config = &self.scene.as_ref().map_or_else(|| config.clone(), |scene| scene.in_units(config));
-        let summary = MapThread { gpu, config, messages: &messages, frames: None, progress, chunks: None }.map(&mut on_round, None);
+        let summary =
+            MapThread { gpu, config, messages: &messages, frames: None, progress, chunks: None }.map(&mut on_round, None);
         let MapSummary { cloud, keyframes, step_ms, error, .. } = summary;
         let exposures = exposures(&self.keyframes, &keyframes);
         let mapped = MappedLog { cloud, exposures, wall_s: (started.elapsed() - paused).as_secs_f64(), steps: step_ms.len() };

@@ -55,7 +55,8 @@ fn errors(gpu: &Arc<Gpu>, map: &GaussianCloud) -> Vec<f32> {
     let error = |id| {
         let (keyframe, rendered) = (elsewhere(id), renderer.render(&elsewhere(id).camera()).unwrap());
         let pixels = keyframe.image.color.pixels().zip(&rendered.color_depth);
-        let sum: f32 = pixels.map(|(pixel, p)| (0..3).map(|k| (f32::from(pixel[k]) / 255.0 - p[k]).abs()).sum::<f32>() / 3.0).sum();
+        let sum: f32 =
+            pixels.map(|(pixel, p)| (0..3).map(|k| (f32::from(pixel[k]) / 255.0 - p[k]).abs()).sum::<f32>() / 3.0).sum();
         sum / rendered.color_depth.len() as f32
     };
     (0..KEYFRAMES).map(error).collect()

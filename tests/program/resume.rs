@@ -12,9 +12,22 @@ use crate::common::recording::{
     scratch, skipped_without_adapter, truncate,
 };
 use keysplat::sequence::SensorKind;
+use keysplat::synthetic::{self, CameraConfig, FurnitureConfig, PathConfig, PathKind, RoomConfig, SceneConfig};
 
 /// A keyframe for nearly each frame, so that there are many moments between two.
 const KEYFRAMES: [&str; 4] = ["--set", "tracking.keyframe_translation=0.02", "--set", "mapping.iterations_per_keyframe=10"];
+const NO_FURNITURE: FurnitureConfig = FurnitureConfig {
+    tables: 0,
+    shelves: 0,
+    sofas: 0,
+    cabinets: 0,
+    lamps: 0,
+    plants: 0,
+    boxes: 0,
+    rugs: 0,
+    pictures: 0,
+    windows: 0,
+};
 /// No run here takes longer.
 const HANGS_AFTER: Duration = Duration::from_secs(180);
 
@@ -156,6 +169,42 @@ fn what_memory_allows_comes_again() {
     survives("limited", recording(), &more, 11);
     let whole = metrics(&scratch().join("limited-whole"));
     assert!(whole.keyframes > Some(12) && whole.gaussians < Some(4000), "neither limit matters: {whole}");
+}
+
+/// A walk through three rooms, of which the GPU holds one and a half.
+fn walk() -> PathBuf {
+    let camera = CameraConfig { width: 96, height: 72, fx: 80.0, fy: 80.0, cx: 47.5, cy: 35.5, ..CameraConfig::default() };
+    let few = FurnitureConfig { pictures: 3, tables: 1, shelves: 1, ..NO_FURNITURE };
+    let room = RoomConfig { width: 5.0, depth: 4.6, rooms: [3, 1], ..RoomConfig::default() };
+    let path = PathConfig { kind: PathKind::Walk, speed: 3.0, turn_rate: 180.0, ..PathConfig::default() };
+    let scene = SceneConfig { seed: 5, frames: 100, fps: 6.0, camera, room, furniture: few, path, ..SceneConfig::default() };
+    let folder = scratch().join("rooms");
+    synthetic::generate(&scene, &folder, &|_, _| ()).unwrap();
+    folder
+}
+
+/// What a checkpoint names in the file of Gaussians is there, whatever was written after it.
+#[test]
+fn a_map_larger_than_the_gpu_comes_again() {
+    if skipped_without_adapter() {
+        return;
+    }
+    let settings = ["refine.steps=150", "refine.density_every=50", "first_iterations=10", "refine.steps_per_keyframe=2"];
+    let settings: Vec<String> = settings.iter().map(|setting| format!("mapping.{setting}")).collect();
+    let bound = ["--known-poses", "--max-gpu-memory", "28M", "--set", "mapping.iterations_per_keyframe=4"];
+    let more: Vec<&str> = settings.iter().flat_map(|s| ["--set", s]).chain(bound).collect();
+    survives("rooms-run", &walk(), &more, 60);
+    let (out, whole) = (scratch().join("rooms-run"), metrics(&scratch().join("rooms-run-whole")));
+    let paging = whole.mapping.unwrap().paging.expect("Gaussians have left the GPU");
+    assert!(paging.gaussians_out > 10_000 && paging.gaussians_in > 1000 && paging.most_away > 5000, "{paging:?}");
+    assert!(whole.peak_gpu_bytes.unwrap() <= 28 << 20 && whole.gaussians.unwrap() > 15_000, "{whole}");
+    assert!(!out.join("chunks.bin").exists(), "it is of no use after the end");
+    // Killed after its checkpoint, and the file is gone.
+    let lost = scratch().join("rooms-lost");
+    killed(keeping(&scratch().join("rooms"), &lost, &more), &lost, 60);
+    std::fs::remove_file(lost.join("chunks.bin")).unwrap();
+    let message = finish(resume(&lost));
+    assert!(message.stderr.contains("chunks.bin") && message.stderr.contains("cannot be opened"), "{}", message.stderr);
 }
 
 #[test]

@@ -112,15 +112,14 @@ fn held_out(recording: &Recording, log: &TrackedLog, gpu: &Arc<Gpu>, mapped: &Ma
     let poses: Vec<_> = log.poses().iter().filter(|(index, _)| is_held_out(*index)).copied().collect();
     let MappedLog { cloud, exposures, .. } = mapped;
     let selection = ViewSelection { poses: &poses, keyframes: &BTreeSet::new(), is_held_out: &is_held_out, exposures };
-    let source =
-        ViewSource {
-            sequence: recording.sequence(),
-            map_scale: config.map_scale,
-            gpu,
-            cloud,
-            most_gaussians: config.mapping.limits.most_rendered(gpu.bytes(), cloud.sh_degree),
-            surface: config.mapping.surface,
-        };
+    let source = ViewSource {
+        sequence: recording.sequence(),
+        map_scale: config.map_scale,
+        gpu,
+        cloud,
+        most_gaussians: config.mapping.limits.most_rendered(gpu.bytes(), cloud.sh_degree),
+        surface: config.mapping.surface,
+    };
     Ok(evaluate_views(source, &selection, &|_| (), &|_| ()).into_diagnostic()?.0)
 }
 

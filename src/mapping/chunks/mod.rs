@@ -91,7 +91,14 @@ impl Chunks {
     /// None yet. What leaves the GPU goes to the file, where that of an earlier run is removed, or to an unnamed one. Where it is `lasting`, what the last
     /// checkpoint names stays until the next.
     pub fn begin(file: Option<PathBuf>, lasting: bool) -> Self {
-        Self { state: ChunksState::default(), index: Index::default(), returned: Vec::new(), downloaded: Cell::new(0), store: Store::begin(file), lasting }
+        Self {
+            state: ChunksState::default(),
+            index: Index::default(),
+            returned: Vec::new(),
+            downloaded: Cell::new(0),
+            store: Store::begin(file),
+            lasting,
+        }
     }
 
     /// Those of a checkpoint.
@@ -100,7 +107,14 @@ impl Chunks {
     /// If the file is missing or too short.
     pub fn restore(file: Option<PathBuf>, state: &ChunksState) -> Result<Self, MappingError> {
         let store = Store::restore(file, state.away.values().map(|chunk| &chunk.stored))?;
-        Ok(Self { state: state.clone(), index: state.index(), returned: Vec::new(), downloaded: Cell::new(0), store, lasting: true })
+        Ok(Self {
+            state: state.clone(),
+            index: state.index(),
+            returned: Vec::new(),
+            downloaded: Cell::new(0),
+            store,
+            lasting: true,
+        })
     }
 
     /// What a checkpoint needs. The file is flushed to the disk.
@@ -162,8 +176,7 @@ impl Chunks {
 
     /// Chunks that a view sees, the nearest first.
     pub fn seen_by(&self, outlook: &Outlook<'_>) -> Vec<ChunkId> {
-        let mut seen: Vec<(f32, ChunkId)> =
-            self.index.seen_by(outlook).map(|(id, ball)| (outlook.depth(ball), id)).collect();
+        let mut seen: Vec<(f32, ChunkId)> = self.index.seen_by(outlook).map(|(id, ball)| (outlook.depth(ball), id)).collect();
         seen.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
         seen.into_iter().map(|(_, id)| id).collect()
     }

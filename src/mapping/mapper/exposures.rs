@@ -14,7 +14,8 @@ impl Mapper {
 
     /// The exposure of the newest keyframe's image, of which the map shows what was surveyed. A map that no step has moved yet shows nothing that counts.
     pub(super) fn exposure(&self, image: &RectifiedImage, survey: Option<&Survey>) -> Exposure {
-        let (config, last) = (&self.config.exposure, self.keyframes.iter().nth_back(1).map_or(Exposure::default(), |k| k.exposure));
+        let (config, last) =
+            (&self.config.exposure, self.keyframes.iter().nth_back(1).map_or(Exposure::default(), |k| k.exposure));
         let shown = survey.filter(|_| config.enabled && self.is_trained());
         shown.map_or(last, |shown| exposure::measure(exposure::recorded(image), &shown.samples, &last, config))
     }

@@ -107,9 +107,7 @@ impl Mapper {
         let most = self.cloud.most(&self.gpu);
         let full = wanted > most;
         if full && !self.is_full {
-            tracing::warn!(
-                "the adapter has room for {most} Gaussians; those that no keyframe of the window sees go to the disk"
-            );
+            tracing::warn!("the adapter has room for {most} Gaussians; those that no keyframe of the window sees go to the disk");
         }
         self.is_full |= full;
         full
