@@ -9,7 +9,7 @@ use serde::Serialize;
 
 use super::{FolderLock, RunResult};
 use crate::evaluation::metrics::{
-    Adapter, AteFigures, DepthBiasFigures, ImageProtocols, MappingFigures, Metrics, PagingFigures, RpeFigures, Times, UsualTimes,
+    Adapter, AteFigures, DepthBiasFigures, ImageProtocols, MappingFigures, Metrics, RpeFigures, Times, UsualTimes,
 };
 use crate::evaluation::views::{ComparedView, ViewSelection, ViewSource, evaluate_views};
 use crate::evaluation::{
@@ -19,7 +19,6 @@ use crate::export::{ExportError, MapFormat};
 use crate::files::{WriteError, remove_partials, write_atomically};
 use crate::geometry::{Se3, Trajectory};
 use crate::gpu::{Gpu, GpuError};
-use crate::mapping;
 use crate::recording::Recording;
 use crate::splat::GaussianCloud;
 use crate::tracking::DepthBias;
@@ -259,14 +258,9 @@ pub fn evaluate(
         is_held_out: &is_held_out,
         exposures: &input.exposures,
     };
-    let source = ViewSource {
-        sequence,
-        map_scale: config.map_scale,
-        gpu,
-        cloud: input.cloud,
-        most_gaussians: config.mapping.limits.most_rendered(gpu.bytes(), input.cloud.sh_degree),
-        surface: config.mapping.surface,
-    };
+    let (cloud, map_scale, surface) = (input.cloud, config.map_scale, config.mapping.surface);
+    let most_gaussians = config.mapping.limits.most_rendered(gpu.bytes(), cloud.sh_degree);
+    let source = ViewSource { sequence, map_scale, gpu, cloud, most_gaussians, surface };
     let (images, views) = evaluate_views(source, &selection, &|view| pictures.add(view), on_view)?;
     comparison.views = views;
     pictures.finish()?;
@@ -381,7 +375,7 @@ pub fn write_metrics(
             ms_per_iteration: UsualTimes::of(&result.step_ms),
             map_width: pinhole.width,
             map_height: pinhole.height,
-            paging: (result.paging != mapping::PagingFigures::default()).then(|| paging(&result.paging)),
+            paging: result.paging_figures(),
         }),
         peak_host_bytes: machine::peak_host_bytes(),
         peak_gpu_bytes: Some(gpu.peak_bytes()),
@@ -393,11 +387,6 @@ pub fn write_metrics(
     };
     write_json(&metrics, &out.join(METRICS))?;
     Ok(metrics)
-}
-
-fn paging(figures: &mapping::PagingFigures) -> PagingFigures {
-    let mapping::PagingFigures { gaussians_out, gaussians_in, most_away } = *figures;
-    PagingFigures { gaussians_out, gaussians_in, most_away }
 }
 
 /// The adapter as metrics name it.

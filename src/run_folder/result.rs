@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use super::history::{History, KeyframeRecord};
-use crate::evaluation::{ExposureRecord, Exposures};
+use crate::evaluation::{ExposureRecord, Exposures, metrics};
 use crate::geometry::{Se3, StampedPose, Trajectory};
 use crate::mapping::PagingFigures;
 use crate::splat::GaussianCloud;
@@ -44,6 +44,12 @@ pub struct RunResult {
 }
 
 impl RunResult {
+    /// What left the adapter for the disk, if anything did.
+    pub(super) fn paging_figures(&self) -> Option<metrics::PagingFigures> {
+        let PagingFigures { gaussians_out, gaussians_in, most_away } = self.paging;
+        (gaussians_out > 0).then_some(metrics::PagingFigures { gaussians_out, gaussians_in, most_away })
+    }
+
     /// Poses of the keyframes.
     pub fn keyframe_trajectory(&self) -> Trajectory {
         Trajectory { poses: self.keyframes.iter().map(KeyframePose::stamped).collect() }

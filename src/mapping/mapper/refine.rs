@@ -14,7 +14,8 @@ use crate::mapping::{DensityConfig, MappingError, RefineConfig};
 use crate::optimise::AdamConfig;
 use crate::splat::model::Dropout;
 
-use super::{BATCH, Interlude, Mapper, Step, Taken};
+use super::steps::Taken;
+use super::{BATCH, Interlude, Mapper, Step};
 
 /// Share of the steps after which nothing is pruned: neighbours take some epochs to fill the place of a Gaussian.
 const LAST_CONTROL: f32 = 0.8;
