@@ -1,5 +1,5 @@
-//! What the mapper holds, within its limits and those of the adapter: Gaussians of least contribution go first, and so do images of
-//! keyframes between near neighbours.
+//! What the mapper holds, within its limits and those of the adapter. Where the window itself sees too much, Gaussians of least contribution go
+//! first, and so do images of keyframes between near neighbours.
 
 use super::Mapper;
 use crate::gpu::GpuError;
