@@ -2,6 +2,8 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use glam::Vec3;
+use nalgebra::Point3;
 use serde::{Deserialize, Serialize};
 
 use super::KeyframeId;
@@ -86,11 +88,20 @@ pub(super) fn motion(old_world_from_camera: &Se3, new_world_from_camera: &Se3, s
     far.then(|| world_from_old_camera * Sim3::from(*old_world_from_camera).inverse())
 }
 
+/// Whether a motion is more than a refinement of what is around a point of the new world: then moments belong to where the Gaussians were.
+pub(super) fn is_far(new_from_old: &Sim3, point: Vec3) -> bool {
+    let point = Point3::new(point.x, point.y, point.z).cast();
+    let shift = new_from_old.inverse().act(&point) - point;
+    shift.norm() > MIN_SHIFT_METRES
+        || new_from_old.rotation.angle() > MIN_TURN_RAD
+        || new_from_old.scale.ln().abs() > MIN_LOG_SCALE
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::render::Division;
-    use nalgebra::{Point3, Vector3};
+    use nalgebra::Vector3;
 
     #[test]
     fn runs_follow_appending_pruning_and_growing() {

@@ -181,6 +181,12 @@ impl MappedKeyframe {
         Ok(Some(restored))
     }
 
+    /// How a correction moves the world around it, new_from_old.
+    pub fn motion(&self, update: &PoseUpdate) -> Sim3 {
+        let world_from_new_camera = Sim3 { scale: update.scale, ..update.world_from_camera.into() };
+        world_from_new_camera * Sim3::from(self.camera.camera_from_world)
+    }
+
     /// Takes in a correction of the tracker. Returns the motion of its Gaussians, new_from_old, once what has added up is more than a
     /// refinement. Its estimated depth is scaled along; measured depth stays.
     pub fn update_pose(&mut self, gpu: &Gpu, store: &mut ImageStore, update: &PoseUpdate) -> Result<Option<Sim3>, MappingError> {

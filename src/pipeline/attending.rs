@@ -86,6 +86,12 @@ impl<'a> Attending<'a> {
         Arc::new(whole)
     }
 
+    /// Shows viewers the whole map, when the run has ended.
+    pub fn show(&self, cloud: &Arc<GaussianCloud>) {
+        let MappingProgress { keyframes, psnr_db, .. } = self.state.borrow().figures;
+        self.progress.snapshots().put(MapSnapshot { cloud: cloud.clone(), keyframes, psnr_db });
+    }
+
     /// Marks the newest download as out of date.
     pub fn changed(&self) {
         self.state.borrow_mut().is_stale = true;

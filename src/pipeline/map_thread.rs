@@ -49,6 +49,9 @@ impl MapSummary {
     /// Takes in what the mapper has in the end.
     fn finish(&mut self, mapper: &Mapper, attending: &Attending<'_>) {
         (self.step_ms, self.cloud, self.paging) = (step_ms(mapper), attending.cloud(mapper), mapper.paging());
+        if mapper.has_paged_out() {
+            attending.show(&self.cloud);
+        }
     }
 }
 

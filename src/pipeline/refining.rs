@@ -132,6 +132,9 @@ impl KeptMapper {
         };
         let refined = refining.refine(&mut Checkpoints::none(), &mut |_| ());
         result.cloud = writable(attending.cloud(&self.mapper));
+        if self.mapper.has_paged_out() {
+            attending.show(&result.cloud);
+        }
         result.step_ms = step_ms(&self.mapper);
         result.wall_s += started.elapsed().as_secs_f64();
         refined

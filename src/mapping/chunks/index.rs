@@ -1,8 +1,9 @@
-//! Chunks by the cell of space that they lie in, so that what a view sees is found without a look at each.
+//! Chunks by the cell of space that they lie in and by the keyframes of their Gaussians, so that none is looked at in vain.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use super::{Ball, ChunkId, Outlook};
+use crate::mapping::KeyframeId;
 
 /// Side of a cell, metres. It decides how long a search takes, not what it finds.
 const CELL_METRES: f32 = 4.0;
@@ -18,6 +19,7 @@ struct Cell {
 #[derive(Debug, Default)]
 pub(super) struct Index {
     cells: BTreeMap<[i32; 3], Cell>,
+    keyframes: BTreeMap<KeyframeId, BTreeSet<ChunkId>>,
 }
 
 impl Index {
@@ -35,6 +37,26 @@ impl Index {
                 self.cells.remove(&key);
             }
         }
+    }
+
+    /// A chunk has Gaussians of these keyframes.
+    pub fn name<'a>(&mut self, id: ChunkId, keyframes: impl IntoIterator<Item = &'a KeyframeId>) {
+        keyframes.into_iter().for_each(|keyframe| {
+            self.keyframes.entry(*keyframe).or_default().insert(id);
+        });
+    }
+
+    pub fn forget<'a>(&mut self, id: ChunkId, keyframes: impl IntoIterator<Item = &'a KeyframeId>) {
+        for keyframe in keyframes {
+            if let Some(chunks) = self.keyframes.get_mut(keyframe) {
+                chunks.remove(&id);
+            }
+        }
+    }
+
+    /// Chunks with Gaussians of some keyframes.
+    pub fn of_keyframes<'a>(&self, keyframes: impl IntoIterator<Item = &'a KeyframeId>) -> BTreeSet<ChunkId> {
+        keyframes.into_iter().filter_map(|keyframe| self.keyframes.get(keyframe)).flatten().copied().collect()
     }
 
     /// Chunks that a view sees, in any order.
@@ -58,8 +80,6 @@ fn cell_of(ball: &Ball) -> [i32; 3] {
 
 #[cfg(test)]
 mod tests {
-    use std::collections::BTreeSet;
-
     use image::RgbImage;
     use proptest::prelude::*;
 

@@ -17,7 +17,7 @@ pub(super) use self::balls::{Ball, parts};
 use self::index::Index;
 pub(super) use self::sight::{Outlook, Sight};
 use self::store::{Store, Stored};
-use super::{KeyframeId, MappingError};
+use super::{KeyframeId, MappingError, anchors};
 use crate::geometry::Sim3;
 use crate::render::CloudPart;
 use crate::splat::{GaussianCloud, ShDegree};
@@ -72,8 +72,8 @@ pub(super) struct Chunks {
     state: ChunksState,
     index: Index,
     returned: Vec<Returned>,
-    /// So many of these had come back before the last download.
-    downloaded: Cell<usize>,
+    /// So many of these had come back before the last download, if there was any.
+    downloaded: Cell<Option<usize>>,
     store: Store,
     /// Whether there are checkpoints.
     lasting: bool,
@@ -95,7 +95,7 @@ impl Chunks {
             state: ChunksState::default(),
             index: Index::default(),
             returned: Vec::new(),
-            downloaded: Cell::new(0),
+            downloaded: Cell::default(),
             store: Store::begin(file),
             lasting,
         }
@@ -111,7 +111,7 @@ impl Chunks {
             state: state.clone(),
             index: state.index(),
             returned: Vec::new(),
-            downloaded: Cell::new(0),
+            downloaded: Cell::default(),
             store,
             lasting: true,
         })
@@ -134,13 +134,14 @@ impl Chunks {
 
     /// The Gaussians on the GPU have been downloaded. Returns which ones are away now; they stay on the disk until the next download.
     pub fn snapshot(&self) -> BTreeSet<ChunkId> {
-        self.downloaded.set(self.returned.len());
+        self.downloaded.set(Some(self.returned.len()));
         self.state.away.keys().copied().collect()
     }
 
     fn reuse_places(&mut self) {
         let Self { returned, downloaded, store, .. } = self;
-        returned[..downloaded.take()].iter_mut().for_each(|returned| returned.in_snapshot = false);
+        let before = downloaded.get_mut().as_mut().map_or(returned.len(), std::mem::take);
+        returned[..before].iter_mut().for_each(|returned| returned.in_snapshot = false);
         returned.retain(|returned| {
             let is_kept = returned.in_snapshot || returned.in_checkpoint;
             if !is_kept {
@@ -198,6 +199,7 @@ impl Chunks {
         };
         self.state.figures.gaussians_out += chunk.gaussians as u64;
         self.index.insert(id, chunk.ball);
+        self.index.name(id, chunk.keyframes.keys());
         self.state.away.insert(id, chunk);
         self.state.figures.most_away = self.state.figures.most_away.max(self.gaussians_away() as u64);
     }
@@ -217,7 +219,7 @@ impl Chunks {
         let mut members = self.store.get(&chunk.stored, chunk.gaussians, sh_degree)?;
         for (keyframe, new_from_old) in &chunk.motions {
             let moved: Vec<usize> = (0..chunk.gaussians).filter(|i| members.keyframes[*i] == *keyframe).collect();
-            members.part.transform(&moved, new_from_old);
+            members.part.transform(&moved, new_from_old, anchors::is_far(new_from_old, chunk.ball.center()));
         }
         Ok(members)
     }
@@ -231,13 +233,17 @@ impl Chunks {
     fn forget(&mut self, id: ChunkId) {
         let Some(chunk) = self.state.away.remove(&id) else { return };
         self.index.remove(id, &chunk.ball);
+        self.index.forget(id, chunk.keyframes.keys());
         self.returned.push(Returned { id, chunk, in_snapshot: true, in_checkpoint: self.lasting });
     }
 
     /// Keyframes have moved, and their Gaussians with them; returns how many of these are away.
     pub fn transform(&mut self, motions: &BTreeMap<KeyframeId, Sim3>) -> usize {
+        let Self { state, index, .. } = self;
         let mut moved = 0;
-        for chunk in self.state.away.values_mut() {
+        for id in index.of_keyframes(motions.keys()) {
+            let Some(chunk) = state.away.get_mut(&id) else { continue };
+            index.remove(id, &chunk.ball);
             let mut reached: Vec<Ball> = Vec::new();
             for (keyframe, gaussians) in &chunk.keyframes {
                 let mut ball = chunk.ball;
@@ -250,8 +256,8 @@ impl Chunks {
                 reached.push(ball);
             }
             chunk.ball = Ball::around_balls(&reached);
+            index.insert(id, chunk.ball);
         }
-        self.index = self.state.index();
         moved
     }
 
@@ -261,9 +267,7 @@ impl Chunks {
     /// If a chunk with Gaussians of others, too, cannot be read.
     pub fn remove(&mut self, keyframes: &BTreeSet<KeyframeId>, sh_degree: ShDegree) -> Result<usize, MappingError> {
         let before = self.gaussians_away();
-        let has_some = |(id, chunk): (&ChunkId, &Chunk)| chunk.keyframes.keys().any(|k| keyframes.contains(k)).then_some(*id);
-        let affected: Vec<ChunkId> = self.state.away.iter().filter_map(has_some).collect();
-        for id in affected {
+        for id in self.index.of_keyframes(keyframes) {
             let chunk = &self.state.away[&id];
             let members = self.read(chunk, sh_degree)?;
             let stay: Vec<usize> = (0..chunk.gaussians).filter(|i| !keyframes.contains(&members.keyframes[*i])).collect();
@@ -297,7 +301,9 @@ impl Chunks {
 
 impl ChunksState {
     fn index(&self) -> Index {
-        self.away.iter().map(|(id, chunk)| (*id, &chunk.ball)).collect()
+        let mut index: Index = self.away.iter().map(|(id, chunk)| (*id, &chunk.ball)).collect();
+        self.away.iter().for_each(|(id, chunk)| index.name(*id, chunk.keyframes.keys()));
+        index
     }
 }
 

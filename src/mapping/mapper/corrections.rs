@@ -13,17 +13,19 @@ impl Mapper {
     /// # Errors
     /// [`MappingError`] if a buffer does not fit or the device fails.
     pub fn update_poses(&mut self, updates: &[PoseUpdate]) -> Result<usize, MappingError> {
-        let mut motions = BTreeMap::new();
+        let (mut motions, mut each) = (BTreeMap::new(), BTreeMap::new());
         let updates: BTreeMap<KeyframeId, &PoseUpdate> = updates.iter().map(|update| (update.keyframe, update)).collect();
         for keyframe in &mut self.keyframes {
             if let Some(update) = updates.get(&keyframe.id) {
+                each.insert(keyframe.id, keyframe.motion(update));
                 let motion = keyframe.update_pose(&self.gpu, &mut self.images, update)?;
                 motions.extend(motion.map(|motion| (keyframe.id, motion)));
             }
         }
         let moved = self.anchors.moved(&motions);
         self.cloud.transform(&self.gpu, &moved)?;
-        let away = if motions.is_empty() { 0 } else { self.chunks.transform(&motions) };
+        // Optimisation takes along what is on the GPU; what is away follows every update.
+        let away = self.chunks.transform(&each);
         Ok(away + moved.iter().map(|motion| motion.run.len()).sum::<usize>())
     }
 

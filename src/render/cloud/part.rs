@@ -101,8 +101,8 @@ impl CloudPart {
         shown(sh_degree, antialiased, &averages)
     }
 
-    /// Moves some Gaussians and clears their moments, as [`GpuCloud::transform`] does.
-    pub fn transform(&mut self, which: &[usize], new_from_old: &Sim3) {
+    /// Moves some Gaussians as [`GpuCloud::transform`] does, and clears their moments if wanted.
+    pub fn transform(&mut self, which: &[usize], new_from_old: &Sim3, clears_moments: bool) {
         let count = self.len();
         if which.is_empty() {
             return;
@@ -118,7 +118,7 @@ impl CloudPart {
                 for (plane, moved) in planes.iter_mut().zip(moved) {
                     which.iter().zip(moved).for_each(|(i, value)| plane[*i] = value);
                 }
-            } else {
+            } else if clears_moments {
                 planes.for_each(|plane| which.iter().for_each(|i| plane[*i] = [0.0; 4]));
             }
         }
