@@ -40,7 +40,8 @@ impl Ball {
         let center = 0.5 * (low + high);
         let reach = |(point, radius): (Vec3, f32)| point.distance(center) + radius;
         let radius = of.iter().fold(0.0, |most: f32, one| most.max(reach(sphere(one))));
-        Self([center.x, center.y, center.z, radius])
+        // Rounding must not leave anything outside.
+        Self([center.x, center.y, center.z, radius * (1.0 + 8.0 * f32::EPSILON)])
     }
 
     pub fn transform(&mut self, new_from_old: &Sim3) {

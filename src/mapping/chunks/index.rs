@@ -61,7 +61,7 @@ impl Index {
 
     /// Chunks that a view sees, in any order.
     pub fn seen_by<'a>(&'a self, outlook: &'a Outlook<'_>) -> impl Iterator<Item = (ChunkId, &'a Ball)> {
-        let cells = self.cells.values().filter(|cell| outlook.sees(&cell.ball));
+        let cells = self.cells.values().filter(|cell| outlook.faces(&cell.ball));
         cells.flat_map(|cell| &cell.chunks).filter(|(_, ball)| outlook.sees(ball)).map(|(id, ball)| (*id, ball))
     }
 }

@@ -53,13 +53,17 @@ impl Sight {
         let rotation = camera.camera_from_world.rotation.to_rotation_matrix();
         let row = |r: usize| Vec3::new(rotation[(r, 0)] as f32, rotation[(r, 1)] as f32, rotation[(r, 2)] as f32);
         let translation = camera.camera_from_world.translation.vector.map(|v| v as f32);
-        Outlook { sight: self, axes: [row(0), row(1), row(2)], translation: translation.into(), pinhole: camera.pinhole }
+        let most = self.farthest.iter().fold(0.0, |most: f32, metres| most.max(*metres));
+        let axes = [row(0), row(1), row(2)];
+        Outlook { sight: self, most, axes, translation: translation.into(), pinhole: camera.pinhole }
     }
 }
 
 /// The same from a pose.
 pub(in crate::mapping) struct Outlook<'a> {
     sight: &'a Sight,
+    /// The largest depth of all.
+    most: f32,
     axes: [Vec3; 3],
     translation: [f32; 3],
     pinhole: Pinhole,
@@ -79,8 +83,11 @@ impl Outlook<'_> {
             // It surrounds the camera, or reaches through the image's plane: its outline says nothing.
             return self.reaches(along(0), along(1), z, radius);
         }
+        // Within a ball, x/z differs from that of its middle by no more than r·√(z² + x²) / (z·(z - r)).
         let blocks = |center: f32, focal: f64, middle: f64, count: u32| {
-            let (pixel, reach) = (focal as f32 * center / z + middle as f32, focal as f32 * radius / nearest + EDGE);
+            let slope = center / z;
+            let (pixel, reach) =
+                (focal as f32 * slope + middle as f32, focal as f32 * radius * (1.0 + slope * slope).sqrt() / nearest + EDGE);
             let block = |pixel: f32| (pixel + 0.5) / BLOCK as f32;
             let (low, high) = (block(pixel - reach).floor().max(0.0), block(pixel + reach).floor().min(count as f32 - 1.0));
             low as u32..(high + 1.0).max(0.0) as u32
@@ -92,6 +99,12 @@ impl Outlook<'_> {
             across.clone().any(|column| line[column as usize] * DEPTH_MARGIN >= nearest)
         };
         down.into_iter().any(reached)
+    }
+
+    /// Whether the view may see a ball within this one: a coarser question than [`Self::sees`].
+    pub fn faces(&self, ball: &Ball) -> bool {
+        let (z, radius) = (self.depth(ball), ball.radius());
+        z + radius >= NEAR_METRES as f32 && z - radius <= self.most * DEPTH_MARGIN
     }
 
     /// Depth of the ball's middle, metres.
@@ -107,13 +120,15 @@ impl Outlook<'_> {
 
     /// Whether a ball around the camera reaches into the pyramid of its view.
     fn reaches(&self, x: f32, y: f32, z: f32, radius: f32) -> bool {
-        let side = |center: f32, focal: f64, middle: f64, size: u32| {
-            let (low, high) = ((-middle / focal) as f32, ((f64::from(size) - middle) / focal) as f32);
+        let (columns, rows) = (self.sight.columns, self.sight.farthest.len() as u32 / self.sight.columns);
+        let side = |center: f32, focal: f64, middle: f64, blocks: u32| {
+            let slope = |pixel: f64| ((pixel - 0.5 - middle) / focal) as f32;
+            let (low, high) = (slope(-f64::from(EDGE)), slope(f64::from(blocks * BLOCK) + f64::from(EDGE)));
             let distance = |slope: f32, sign: f32| sign * (center - slope * z) / (1.0 + slope * slope).sqrt();
             distance(low, 1.0) > -radius && distance(high, -1.0) > -radius
         };
-        let Pinhole { fx, fy, cx, cy, width, height } = self.pinhole;
-        side(x, fx, cx, width) && side(y, fy, cy, height)
+        let Pinhole { fx, fy, cx, cy, .. } = self.pinhole;
+        side(x, fx, cx, columns) && side(y, fy, cy, rows)
     }
 }
 
