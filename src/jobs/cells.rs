@@ -44,15 +44,10 @@ pub(super) fn merge(plan: &Plan, done: &[usize]) -> Result<String, JobError> {
     let is_done: Vec<bool> = cells.iter().map(|(number, _)| done.contains(number)).collect();
     let run = plan.folder().join(&first.run);
     let (whole, format) = map_of(&run)?;
-    let mut merged = whole.emptied();
     let mut table = String::from("| cell | keyframes | steps | Gaussians before | after | s |\n|---|---|---|---|---|---|\n");
     let owner = |i: usize| cells.iter().position(|(_, cell)| cell.region.place(whole.means[i]) == Place::Core);
     let owners: Vec<Option<usize>> = (0..whole.len()).map(owner).collect();
-    for (i, owner) in owners.iter().enumerate() {
-        if owner.is_none_or(|cell| !is_done[cell]) {
-            merged.push(whole.get(i));
-        }
-    }
+    let mut merged = whole.picked((0..whole.len()).filter(|i| owners[*i].is_none_or(|cell| !is_done[cell])));
     for (cell, (number, _)) in cells.iter().enumerate() {
         let name = &plan.task(*number)?.name;
         let before = owners.iter().filter(|owner| **owner == Some(cell)).count();
@@ -63,6 +58,7 @@ pub(super) fn merge(plan: &Plan, done: &[usize]) -> Result<String, JobError> {
         let folder = result_folder(plan, *number);
         let row: CellRow = read(&folder.join(CellRow::FILE))?;
         let (core, _) = map_of(&folder)?;
+        // Options of the plan may have given the cells another degree.
         (0..core.len()).for_each(|i| merged.push(core.get(i)));
         let CellRow { keyframes, steps, gaussians, wall_s } = row;
         let _ = writeln!(table, "| {name} | {keyframes} | {steps} | {before} | {gaussians} | {wall_s:.1} |");

@@ -81,9 +81,7 @@ impl Anchors {
 /// than a refinement.
 pub(super) fn motion(old_world_from_camera: &Se3, new_world_from_camera: &Se3, scale: f64) -> Option<Sim3> {
     let old_from_new = old_world_from_camera.inverse() * new_world_from_camera;
-    let far = old_from_new.translation.vector.norm() > MIN_SHIFT_METRES
-        || old_from_new.rotation.angle() > MIN_TURN_RAD
-        || scale.ln().abs() > MIN_LOG_SCALE;
+    let far = is_beyond_refinement(old_from_new.translation.vector.norm(), old_from_new.rotation.angle(), scale);
     let world_from_old_camera = Sim3 { scale, ..Sim3::from(*new_world_from_camera) };
     far.then(|| world_from_old_camera * Sim3::from(*old_world_from_camera).inverse())
 }
@@ -92,9 +90,11 @@ pub(super) fn motion(old_world_from_camera: &Se3, new_world_from_camera: &Se3, s
 pub(super) fn is_far(new_from_old: &Sim3, point: Vec3) -> bool {
     let point = Point3::new(point.x, point.y, point.z).cast();
     let shift = new_from_old.inverse().act(&point) - point;
-    shift.norm() > MIN_SHIFT_METRES
-        || new_from_old.rotation.angle() > MIN_TURN_RAD
-        || new_from_old.scale.ln().abs() > MIN_LOG_SCALE
+    is_beyond_refinement(shift.norm(), new_from_old.rotation.angle(), new_from_old.scale)
+}
+
+fn is_beyond_refinement(shift_metres: f64, turn_rad: f64, scale: f64) -> bool {
+    shift_metres > MIN_SHIFT_METRES || turn_rad > MIN_TURN_RAD || scale.ln().abs() > MIN_LOG_SCALE
 }
 
 #[cfg(test)]

@@ -174,7 +174,9 @@ impl Mapper {
         });
         let survey = survey?;
         let exposure = self.timed("exposure", |mapper| mapper.exposure(&keyframe.image, survey.as_ref()));
-        self.keyframes.last_mut().into_iter().for_each(|newest| newest.exposure = exposure);
+        if let Some(newest) = self.keyframes.last_mut() {
+            newest.exposure = exposure;
+        }
         self.limit_gpu_images()?;
         let insert =
             |mapper: &mut Self, candidates| mapper.insert_gaussians(&keyframe, &candidates, (survey.as_ref(), &exposure));

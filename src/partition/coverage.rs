@@ -2,8 +2,6 @@
 //!
 //! Neither a GPU nor the whole map's place on one is needed. Each Gaussian is taken as round, with the geometric mean of its two longer axes.
 
-use glam::Vec3;
-
 use crate::splat::model::NEAR_METRES;
 use crate::splat::{GaussianCloud, ViewCamera, opacity_from_raw};
 
@@ -88,10 +86,7 @@ impl Coverage {
 
 /// The Gaussians in view, front to back.
 fn seen(cloud: &GaussianCloud, camera: &ViewCamera, (columns, rows): (u32, u32)) -> Vec<Seen> {
-    let rotation = camera.camera_from_world.rotation.to_rotation_matrix();
-    let row = |r: usize| Vec3::new(rotation[(r, 0)] as f32, rotation[(r, 1)] as f32, rotation[(r, 2)] as f32);
-    let axes = [row(0), row(1), row(2)];
-    let translation = camera.camera_from_world.translation.vector.map(|v| v as f32);
+    let (axes, translation) = camera.rows();
     let pinhole = &camera.pinhole;
     // Pixel centres are whole numbers; the first block begins half a pixel before the first centre.
     let in_blocks = |pixel: f32| (pixel + 0.5) / BLOCK as f32;
@@ -125,7 +120,7 @@ fn blocks((x, y): (f32, f32), radius: f32, (columns, rows): (u32, u32)) -> impl 
 
 #[cfg(test)]
 mod tests {
-    use glam::Quat;
+    use glam::{Quat, Vec3};
 
     use super::*;
     use crate::geometry::{Pinhole, Se3};

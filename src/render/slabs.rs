@@ -3,7 +3,6 @@
 
 use std::sync::Arc;
 
-use glam::Vec3;
 use rayon::prelude::*;
 
 use super::{GpuCloud, Rasterizer, Rendered};
@@ -71,10 +70,7 @@ impl<'a> MapRenderer<'a> {
 
 /// Gaussians that may be in view, front to back: depth keys and places. Those of one key are in map order, as the rasterizer draws them.
 fn in_view(map: &GaussianCloud, camera: &ViewCamera) -> Vec<(u32, u32)> {
-    let rotation = camera.camera_from_world.rotation.to_rotation_matrix();
-    let row = |r: usize| Vec3::new(rotation[(r, 0)] as f32, rotation[(r, 1)] as f32, rotation[(r, 2)] as f32);
-    let axes = [row(0), row(1), row(2)];
-    let translation = camera.camera_from_world.translation.vector.map(|v| v as f32);
+    let (axes, translation) = camera.rows();
     let p = &camera.pinhole;
     // Slopes of the sides of the view, the dilation included, and how a distance along an axis becomes one from a side.
     let side = |focal: f64, middle: f64, size: u32| {

@@ -85,10 +85,8 @@ impl GaussianCloud {
 
     /// At most `count` of its Gaussians, spread evenly over it.
     pub fn thinned(&self, count: usize) -> Self {
-        let mut cloud = self.emptied();
         let count = count.min(self.len());
-        (0..count).for_each(|i| cloud.push(self.get(i * self.len() / count)));
-        cloud
+        self.picked((0..count).map(|i| i * self.len() / count))
     }
 
     /// Appends a Gaussian; missing coefficients are zero, superfluous ones are dropped.
@@ -146,9 +144,7 @@ impl GaussianCloud {
 
     /// Its Gaussians without those that hold a NaN or an infinity.
     pub fn finite(&self) -> Self {
-        let mut cloud = self.emptied();
-        (0..self.len()).filter(|&i| self.is_finite(i)).for_each(|i| cloud.push(self.get(i)));
-        cloud
+        self.picked((0..self.len()).filter(|&i| self.is_finite(i)))
     }
 
     fn is_finite(&self, i: usize) -> bool {

@@ -1,6 +1,7 @@
 //! What rendering a Gaussian means: the constants of the splatting model and the camera of a view, shared by the rasterizer and its
 //! oracle.
 
+use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
 use crate::geometry::{Pinhole, Se3};
@@ -71,6 +72,15 @@ pub struct ViewCamera {
     pub pinhole: Pinhole,
     /// Pose.
     pub camera_from_world: Se3,
+}
+
+impl ViewCamera {
+    /// Pose in single precision: rows of the rotation, and the translation in metres.
+    pub fn rows(&self) -> ([Vec3; 3], [f32; 3]) {
+        let rotation = self.camera_from_world.rotation.to_rotation_matrix();
+        let row = |r: usize| Vec3::new(rotation[(r, 0)] as f32, rotation[(r, 1)] as f32, rotation[(r, 2)] as f32);
+        ([row(0), row(1), row(2)], self.camera_from_world.translation.vector.map(|v| v as f32).into())
+    }
 }
 
 /// The bounds min x, max x, min y, max y on x/z and y/z inside the projection's Jacobian.

@@ -14,24 +14,9 @@ fn building() -> SceneConfig {
         fps: 8.0,
         camera: CameraConfig { width: 32, height: 24, fx: 26.0, fy: 26.0, cx: 15.5, cy: 11.5, ..CameraConfig::default() },
         room: RoomConfig { width: 5.4, depth: 5.0, rooms: [2, 2], ..RoomConfig::default() },
-        furniture: FurnitureConfig { tables: 1, shelves: 1, plants: 1, pictures: 3, rugs: 1, ..no_furniture() },
+        furniture: FurnitureConfig { tables: 1, shelves: 1, plants: 1, pictures: 3, rugs: 1, ..FurnitureConfig::NONE },
         path: PathConfig { kind: PathKind::Walk, speed: 0.9, turn_rate: 60.0, ..defaults.path.clone() },
         ..defaults
-    }
-}
-
-fn no_furniture() -> FurnitureConfig {
-    FurnitureConfig {
-        tables: 0,
-        shelves: 0,
-        sofas: 0,
-        cabinets: 0,
-        lamps: 0,
-        plants: 0,
-        boxes: 0,
-        rugs: 0,
-        pictures: 0,
-        windows: 0,
     }
 }
 
@@ -140,7 +125,7 @@ fn rooms_differ_and_are_lit() {
 
 #[test]
 fn the_exact_surface_of_a_building_lies_on_its_solids_in_all_rooms() {
-    let config = SceneConfig { frames: 480, furniture: no_furniture(), ..building() };
+    let config = SceneConfig { frames: 480, furniture: FurnitureConfig::NONE, ..building() };
     let (surface, plan) = (visible_surface(&config).unwrap(), Plan::new(&config).unwrap());
     let mut rooms = std::collections::BTreeSet::new();
     for p in surface.vertices.iter().step_by(53).map(|p| p.as_dvec3()) {

@@ -128,6 +128,12 @@ pub struct FurnitureConfig {
     pub windows: usize,
 }
 
+impl FurnitureConfig {
+    /// An empty room.
+    pub const NONE: Self =
+        Self { tables: 0, shelves: 0, sofas: 0, cabinets: 0, lamps: 0, plants: 0, boxes: 0, rugs: 0, pictures: 0, windows: 0 };
+}
+
 impl Default for FurnitureConfig {
     fn default() -> Self {
         Self { tables: 2, shelves: 2, sofas: 1, cabinets: 2, lamps: 2, plants: 2, boxes: 2, rugs: 1, pictures: 9, windows: 1 }

@@ -16,18 +16,6 @@ use keysplat::synthetic::{self, CameraConfig, FurnitureConfig, PathConfig, PathK
 
 /// A keyframe for nearly each frame, so that there are many moments between two.
 const KEYFRAMES: [&str; 4] = ["--set", "tracking.keyframe_translation=0.02", "--set", "mapping.iterations_per_keyframe=10"];
-const NO_FURNITURE: FurnitureConfig = FurnitureConfig {
-    tables: 0,
-    shelves: 0,
-    sofas: 0,
-    cabinets: 0,
-    lamps: 0,
-    plants: 0,
-    boxes: 0,
-    rugs: 0,
-    pictures: 0,
-    windows: 0,
-};
 /// No run here takes longer.
 const HANGS_AFTER: Duration = Duration::from_secs(180);
 
@@ -174,7 +162,7 @@ fn what_memory_allows_comes_again() {
 /// A walk through three rooms, of which the GPU holds one and a half.
 fn walk() -> PathBuf {
     let camera = CameraConfig { width: 96, height: 72, fx: 80.0, fy: 80.0, cx: 47.5, cy: 35.5, ..CameraConfig::default() };
-    let few = FurnitureConfig { pictures: 3, tables: 1, shelves: 1, ..NO_FURNITURE };
+    let few = FurnitureConfig { pictures: 3, tables: 1, shelves: 1, ..FurnitureConfig::NONE };
     let room = RoomConfig { width: 5.0, depth: 4.6, rooms: [3, 1], ..RoomConfig::default() };
     let path = PathConfig { kind: PathKind::Walk, speed: 3.0, turn_rate: 180.0, ..PathConfig::default() };
     let scene = SceneConfig { seed: 5, frames: 100, fps: 6.0, camera, room, furniture: few, path, ..SceneConfig::default() };

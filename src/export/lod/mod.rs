@@ -39,12 +39,7 @@ impl Levels {
     /// Divides a map into cells and merges the Gaussians of each cell, level by level. The same map gives the same levels.
     pub fn new(cloud: &GaussianCloud) -> Self {
         let (tree, leaves) = cells::divide(&cloud.means, MOST_IN_CELL);
-        let part = |leaf: &Vec<usize>| {
-            let mut part = cloud.emptied();
-            leaf.iter().for_each(|i| part.push(cloud.get(*i)));
-            part
-        };
-        let mut levels: Vec<Vec<GaussianCloud>> = vec![leaves.iter().map(part).collect()];
+        let mut levels: Vec<Vec<GaussianCloud>> = vec![leaves.iter().map(|leaf| cloud.picked(leaf.iter().copied())).collect()];
         while let Some(last) = levels.last().filter(|last| count(last) > FEW && levels.len() < MOST_LEVELS) {
             let next = simplified(last.clone(), count(last) / RATIO);
             // Cells of one Gaussian each are not merged further.
@@ -65,7 +60,7 @@ impl Levels {
     pub fn level(&self, level: usize) -> GaussianCloud {
         let cells = self.levels.get(level).map_or(&[][..], Vec::as_slice);
         let mut whole = self.levels[0][0].emptied();
-        cells.iter().for_each(|cell| (0..cell.len()).for_each(|i| whole.push(cell.get(i))));
+        cells.iter().for_each(|cell| whole.append(cell));
         whole
     }
 

@@ -134,7 +134,7 @@ impl Levels {
                 let run = Run { file, offset: together.len(), count: cells[*cell].len() };
                 runs[*cell].insert(piece.level, run);
                 // Neighbours side by side compress well.
-                sog::order(&cells[*cell].means).into_iter().for_each(|i| together.push(cells[*cell].get(i)));
+                together.append(&cells[*cell].picked(sog::order(&cells[*cell].means).into_iter()));
             }
             for written in sog::files(together, cameras)? {
                 write_atomically(&folder.join(written.name), &written.bytes)?;

@@ -22,8 +22,7 @@ const MOST_HARMONIC: f32 = 1e4;
 /// The whole file, for cameras at these poses (world from camera), which may be none.
 pub(super) fn encode(cloud: &GaussianCloud, cameras: &[Se3], precision: &Precision) -> Result<Vec<u8>, ExportError> {
     check(cloud)?;
-    let mut sorted = cloud.emptied();
-    super::morton::image_order(&cloud.means, Plane::width(cloud.len())).into_iter().for_each(|i| sorted.push(cloud.get(i)));
+    let sorted = cloud.picked(super::morton::image_order(&cloud.means, Plane::width(cloud.len())).into_iter());
     let files = encode_files(sorted, cameras, precision)?;
     bundle(&files).map_err(|reason| ExportError::Encode { reason })
 }

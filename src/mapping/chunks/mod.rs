@@ -84,6 +84,8 @@ pub(super) struct Chunks {
 pub(super) struct ChunksState {
     away: BTreeMap<ChunkId, Chunk>,
     next: ChunkId,
+    /// Gaussians of all that are away.
+    gaussians: usize,
     figures: PagingFigures,
 }
 
@@ -91,14 +93,7 @@ impl Chunks {
     /// None yet. What leaves the GPU goes to the file, where that of an earlier run is removed, or to an unnamed one. Where it is `lasting`, what the last
     /// checkpoint names stays until the next.
     pub fn begin(file: Option<PathBuf>, lasting: bool) -> Self {
-        Self {
-            state: ChunksState::default(),
-            index: Index::default(),
-            returned: Vec::new(),
-            downloaded: Cell::default(),
-            store: Store::begin(file),
-            lasting,
-        }
+        Self::with(ChunksState::default(), Store::begin(file), lasting)
     }
 
     /// Those of a checkpoint.
@@ -107,14 +102,11 @@ impl Chunks {
     /// If the file is missing or too short.
     pub fn restore(file: Option<PathBuf>, state: &ChunksState) -> Result<Self, MappingError> {
         let store = Store::restore(file, state.away.values().map(|chunk| &chunk.stored))?;
-        Ok(Self {
-            state: state.clone(),
-            index: state.index(),
-            returned: Vec::new(),
-            downloaded: Cell::default(),
-            store,
-            lasting: true,
-        })
+        Ok(Self::with(state.clone(), store, true))
+    }
+
+    fn with(state: ChunksState, store: Store, lasting: bool) -> Self {
+        Self { index: state.index(), state, returned: Vec::new(), downloaded: Cell::default(), store, lasting }
     }
 
     /// What a checkpoint needs. The file is flushed to the disk.
@@ -135,7 +127,7 @@ impl Chunks {
     /// The Gaussians on the GPU have been downloaded. Returns which ones are away now; they stay on the disk until the next download.
     pub fn snapshot(&self) -> BTreeSet<ChunkId> {
         self.downloaded.set(Some(self.returned.len()));
-        self.state.away.keys().copied().collect()
+        self.away()
     }
 
     fn reuse_places(&mut self) {
@@ -162,7 +154,7 @@ impl Chunks {
 
     /// Number of Gaussians that are not on the GPU.
     pub fn gaussians_away(&self) -> usize {
-        self.state.away.values().map(|chunk| chunk.gaussians).sum()
+        self.state.gaussians
     }
 
     /// Number of Gaussians of a chunk.
@@ -197,11 +189,12 @@ impl Chunks {
             motions: BTreeMap::new(),
             stored: self.store.put(members),
         };
+        self.state.gaussians += chunk.gaussians;
         self.state.figures.gaussians_out += chunk.gaussians as u64;
+        self.state.figures.most_away = self.state.figures.most_away.max(self.state.gaussians as u64);
         self.index.insert(id, chunk.ball);
         self.index.name(id, chunk.keyframes.keys());
         self.state.away.insert(id, chunk);
-        self.state.figures.most_away = self.state.figures.most_away.max(self.gaussians_away() as u64);
     }
 
     /// A chunk that comes back in this round: as it left, but for how its keyframes have moved since.
@@ -232,6 +225,7 @@ impl Chunks {
 
     fn forget(&mut self, id: ChunkId) {
         let Some(chunk) = self.state.away.remove(&id) else { return };
+        self.state.gaussians -= chunk.gaussians;
         self.index.remove(id, &chunk.ball);
         self.index.forget(id, chunk.keyframes.keys());
         self.returned.push(Returned { id, chunk, in_snapshot: true, in_checkpoint: self.lasting });

@@ -50,12 +50,9 @@ impl Sight {
     }
 
     pub fn from<'a>(&'a self, camera: &ViewCamera) -> Outlook<'a> {
-        let rotation = camera.camera_from_world.rotation.to_rotation_matrix();
-        let row = |r: usize| Vec3::new(rotation[(r, 0)] as f32, rotation[(r, 1)] as f32, rotation[(r, 2)] as f32);
-        let translation = camera.camera_from_world.translation.vector.map(|v| v as f32);
+        let (axes, translation) = camera.rows();
         let most = self.farthest.iter().fold(0.0, |most: f32, metres| most.max(*metres));
-        let axes = [row(0), row(1), row(2)];
-        Outlook { sight: self, most, axes, translation: translation.into(), pinhole: camera.pinhole }
+        Outlook { sight: self, most, axes, translation, pinhole: camera.pinhole }
     }
 }
 

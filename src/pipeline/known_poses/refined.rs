@@ -107,15 +107,14 @@ impl Refined {
         if chosen.is_empty() {
             return Err(PipelineError::NotSeen);
         }
-        let mut part = cloud.emptied();
         // What reaches through the border stays as it is on both sides: moved across it, it would be left twice, or not at all.
         let is_shared =
             |i: usize| region.border_crosses(cloud.means[i], BORDER_DEVIATIONS * cloud.log_scales[i].max_element().exp());
         let moves = |i: usize| places[i] != Place::Beyond && supervision[i].is_enough() && !is_shared(i);
         let stays = |i: usize| !moves(i) && (places[i] != Place::Beyond || is_context[i]);
-        (0..cloud.len()).filter(|i| stays(*i)).for_each(|i| part.push(cloud.get(i)));
+        let mut part = cloud.picked((0..cloud.len()).filter(|i| stays(*i)));
         let frozen = part.len();
-        (0..cloud.len()).filter(|i| moves(*i)).for_each(|i| part.push(cloud.get(i)));
+        part.append(&cloud.picked((0..cloud.len()).filter(|i| moves(*i))));
         tracing::info!(keyframes = chosen.len(), gaussians = part.len() - frozen, frozen, "region");
         Ok(Self { keyframes: chosen, map: InitialMap { cloud: Arc::new(part), frozen }, ..self })
     }
@@ -142,9 +141,7 @@ impl Supervision {
 
 /// The core of a region in a map, refined or frozen.
 pub(super) fn core_of(map: &GaussianCloud, region: &Region) -> GaussianCloud {
-    let mut core = map.emptied();
-    (0..map.len()).filter(|&i| region.place(map.means[i]) == Place::Core).for_each(|i| core.push(map.get(i)));
-    core
+    map.picked((0..map.len()).filter(|&i| region.place(map.means[i]) == Place::Core))
 }
 
 /// The frame nearest in time to each pose, once.
