@@ -50,7 +50,7 @@ var<private> size: f32;
 var<private> sampling_interval: f32;
 
 fn is_wanted(i: u32) -> bool {
-    return i >= adam.frozen;
+    return i >= adam.frozen && moments_2[view.capacity + i].w == 0.0;
 }
 
 // In the first moments, lane w of planes 1 and 3 counts the Gaussian's steps, of all and of its higher harmonics.

@@ -17,64 +17,93 @@ const MIN_TURN_RAD: f64 = 0.5 * std::f64::consts::PI / 180.0;
 /// As far as [`MIN_SHIFT_METRES`] at the two metres of a room.
 const MIN_LOG_SCALE: f64 = 0.005;
 
-/// The Gaussians' keyframes, `[N]` in map order. Inserted Gaussians are appended and pruning keeps the order, so most of a keyframe's Gaussians
-/// lie side by side.
+/// What the mapper knows of each Gaussian, `[N]` in map order. Inserted Gaussians are appended and pruning keeps the order, so most of a keyframe's
+/// Gaussians lie side by side.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
-pub(super) struct Anchors(Vec<KeyframeId>);
+pub(super) struct Anchors {
+    keyframes: Vec<KeyframeId>,
+    /// Whether no step moves it.
+    fixed: Vec<bool>,
+}
 
 impl Anchors {
     /// The newest `count` Gaussians are of `keyframe`.
     pub fn append(&mut self, keyframe: KeyframeId, count: usize) {
-        self.0.extend(std::iter::repeat_n(keyframe, count));
-    }
-
-    /// Follows a plan: children are of their parent's keyframe.
-    pub fn apply(&mut self, plan: &Plan) {
-        let children: Vec<KeyframeId> = plan.divided.iter().flat_map(|(parent, _)| [self.0[*parent as usize]; 2]).collect();
-        // What lies between two that go moves up, as one piece.
-        let ends = plan.removed.iter().skip(1).map(|i| *i as usize).chain([self.0.len()]);
-        let mut kept = plan.removed.first().map_or(self.0.len(), |first| *first as usize);
-        for (removed, end) in plan.removed.iter().zip(ends) {
-            let piece = *removed as usize + 1..end;
-            let length = piece.len();
-            self.0.copy_within(piece, kept);
-            kept += length;
-        }
-        self.0.truncate(kept);
-        self.0.extend(children);
-    }
-
-    /// The Gaussians of some keyframes, ascending.
-    pub fn of(&self, keyframes: &BTreeSet<KeyframeId>) -> Vec<u32> {
-        (0..).zip(&self.0).filter(|(_, keyframe)| keyframes.contains(keyframe)).map(|(gaussian, _)| gaussian).collect()
+        self.put_back(&vec![keyframe; count]);
     }
 
     /// Gaussians that come back, of these keyframes.
     pub fn put_back(&mut self, keyframes: &[KeyframeId]) {
-        self.0.extend_from_slice(keyframes);
+        self.keyframes.extend_from_slice(keyframes);
+        self.fixed.resize(self.keyframes.len(), false);
+    }
+
+    /// Follows a plan: children are of their parent's keyframe.
+    pub fn apply(&mut self, plan: &Plan) {
+        apply(&mut self.keyframes, plan);
+        apply(&mut self.fixed, plan);
+    }
+
+    /// The Gaussians of some keyframes, ascending.
+    pub fn of(&self, keyframes: &BTreeSet<KeyframeId>) -> Vec<u32> {
+        (0..).zip(&self.keyframes).filter(|(_, keyframe)| keyframes.contains(keyframe)).map(|(gaussian, _)| gaussian).collect()
     }
 
     /// The keyframes of some Gaussians.
     pub fn at(&self, places: &[u32]) -> Vec<KeyframeId> {
-        places.iter().map(|place| self.0[*place as usize]).collect()
+        places.iter().map(|place| self.keyframes[*place as usize]).collect()
+    }
+
+    /// The keyframe of a Gaussian.
+    pub fn keyframe(&self, place: u32) -> KeyframeId {
+        self.keyframes[place as usize]
     }
 
     pub fn len(&self) -> usize {
-        self.0.len()
+        self.keyframes.len()
     }
 
-    /// The runs of Gaussians whose keyframe is among `motions`, ascending.
-    pub fn moved(&self, motions: &BTreeMap<KeyframeId, Sim3>) -> Vec<RunMotion> {
+    /// No step moves the Gaussians at these places from now on, and only these.
+    pub fn fix(&mut self, places: &[u32]) {
+        self.fixed.fill(false);
+        places.iter().for_each(|place| self.fixed[*place as usize] = true);
+    }
+
+    /// Those that no step moves, ascending.
+    pub fn fixed(&self) -> impl Iterator<Item = u32> + '_ {
+        (0..).zip(&self.fixed).filter(|(_, fixed)| **fixed).map(|(gaussian, _)| gaussian)
+    }
+
+    /// The runs of Gaussians whose keyframe has moved, ascending. Those that steps move follow `motions`, beyond a refinement; the fixed ones, which
+    /// no step takes along, follow `each`.
+    pub fn moved(&self, motions: &BTreeMap<KeyframeId, Sim3>, each: &BTreeMap<KeyframeId, Sim3>) -> Vec<RunMotion> {
+        let alike: Vec<(KeyframeId, bool)> = self.keyframes.iter().copied().zip(self.fixed.iter().copied()).collect();
         let mut runs = Vec::new();
         let mut first = 0;
-        for run in self.0.chunk_by(|a, b| a == b) {
-            if let Some(new_from_old) = motions.get(&run[0]) {
-                runs.push(RunMotion { run: first..first + run.len(), new_from_old: *new_from_old });
-            }
+        for run in alike.chunk_by(|a, b| a == b) {
+            let (keyframe, is_fixed) = run[0];
+            let motion = if is_fixed { each } else { motions }.get(&keyframe);
+            let clears_moments = motions.contains_key(&keyframe);
+            runs.extend(motion.map(|motion| RunMotion { run: first..first + run.len(), new_from_old: *motion, clears_moments }));
             first += run.len();
         }
         runs
     }
+}
+
+/// What lies between two that go moves up, as one piece; a child is as its parent.
+fn apply<T: Copy>(each: &mut Vec<T>, plan: &Plan) {
+    let children: Vec<T> = plan.divided.iter().flat_map(|(parent, _)| [each[*parent as usize]; 2]).collect();
+    let ends = plan.removed.iter().skip(1).map(|i| *i as usize).chain([each.len()]);
+    let mut kept = plan.removed.first().map_or(each.len(), |first| *first as usize);
+    for (removed, end) in plan.removed.iter().zip(ends) {
+        let piece = *removed as usize + 1..end;
+        let length = piece.len();
+        each.copy_within(piece, kept);
+        kept += length;
+    }
+    each.truncate(kept);
+    each.extend(children);
 }
 
 /// new_from_old, how a world moves that is held by a camera, when distances from the camera grow by a factor; `None` if that is no more
@@ -109,14 +138,20 @@ mod tests {
         [(0, 4), (2, 3), (5, 2)].into_iter().for_each(|(keyframe, count)| anchors.append(keyframe, count));
         let divided = vec![(1, Division::Split), (5, Division::Clone)];
         anchors.apply(&Plan { removed: vec![1, 2, 5, 7], divided });
-        assert_eq!(anchors.0, [0, 0, 2, 2, 5, 0, 0, 2, 2]);
+        assert_eq!(anchors.keyframes, [0, 0, 2, 2, 5, 0, 0, 2, 2]);
         let new_from_old = Sim3::from(Se3::translation(1.0, 0.0, 0.0));
         let motions = [2, 5, 7].map(|keyframe| (keyframe, new_from_old)).into();
-        assert_eq!(anchors.moved(&motions), [2..4, 4..5, 7..9].map(|run| RunMotion { run, new_from_old }));
-        assert!(anchors.moved(&BTreeMap::new()).is_empty());
+        let none = BTreeMap::new();
+        let run = |clears_moments| move |run| RunMotion { run, new_from_old, clears_moments };
+        assert_eq!(anchors.moved(&motions, &none), [2..4, 4..5, 7..9].map(run(true)));
+        assert!(anchors.moved(&none, &motions).is_empty());
+        anchors.fix(&[3, 8]);
+        assert_eq!(anchors.moved(&motions, &none), [2..3, 4..5, 7..8].map(run(true)));
+        assert_eq!(anchors.moved(&none, &motions), [3..4, 8..9].map(run(false)));
+        assert_eq!(anchors.moved(&motions, &motions), [2..3, 3..4, 4..5, 7..8, 8..9].map(run(true)));
         assert_eq!(anchors.of(&[2, 5, 7].into()), [2, 3, 4, 7, 8]);
-        anchors.apply(&Plan::removing(vec![0, 8]));
-        assert_eq!(anchors.0, [0, 2, 2, 5, 0, 0, 2]);
+        anchors.apply(&Plan::removing(vec![0, 7]));
+        assert_eq!((&*anchors.keyframes, anchors.fixed().collect()), (&[0, 2, 2, 5, 0, 0, 2][..], vec![2, 6]));
         anchors.apply(&Plan::default());
         assert_eq!(anchors.len(), 7);
     }

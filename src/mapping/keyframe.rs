@@ -5,6 +5,7 @@ mod images;
 use std::borrow::Cow;
 
 use image::GrayImage;
+use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
 use super::anchors;
@@ -245,6 +246,11 @@ impl MappedKeyframe {
     /// What it sees from where it is.
     pub fn outlook(&self) -> Outlook<'_> {
         self.sight.from(&self.camera)
+    }
+
+    /// Of the camera in the world, metres.
+    pub fn position(&self) -> Vector3<f64> {
+        self.camera.camera_from_world.inverse().translation.vector
     }
 
     /// View of the plane sweep.

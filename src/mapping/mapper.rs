@@ -8,7 +8,9 @@ mod paging;
 mod refine;
 mod start;
 mod state;
+mod stays;
 mod steps;
+mod views;
 mod within_limits;
 
 use std::borrow::Cow;
@@ -82,6 +84,8 @@ pub struct Mapper {
     chunks: Chunks,
     /// Keyframes whose views need what they see on the GPU at present, the most important first.
     needing: Vec<usize>,
+    /// Keyframes that steps can learn from while a part of the map is away, ascending.
+    learnable: Vec<usize>,
     /// Epochs of each keyframe in a final refinement that moves chunks.
     visits: Vec<u32>,
     density: DensityPasses,
@@ -122,6 +126,7 @@ impl Mapper {
             anchors: Anchors::default(),
             chunks: Chunks::begin(None, false),
             needing: Vec::new(),
+            learnable: Vec::new(),
             visits: Vec::new(),
             density: DensityPasses::new(&gpu)?,
             keyframes: Vec::new(),
@@ -315,7 +320,8 @@ impl Mapper {
         if self.cloud.is_empty() {
             return Ok(KeyframeReport::default());
         }
-        let window = self.complete(schedule::window(&self.keyframes, &self.config.window));
+        self.timed("paging", Self::fix_context)?;
+        let window = self.learnable(schedule::window(&self.keyframes, &self.config.window));
         if window.is_empty() {
             return Ok(KeyframeReport::default());
         }
@@ -327,9 +333,9 @@ impl Mapper {
         let mut scoring = if controlled { self.scoring_steps(&window, density) } else { Vec::new() };
         scoring.truncate(iterations);
         let unscored = iterations - scoring.len();
-        let (len, mut rng) = (self.keyframes.len(), self.rng.clone());
-        let mut before = schedule::steps(&window, (len, &|k| self.is_complete(k)), unscored, &mut rng, &config.window);
-        self.rng = rng;
+        let beyond = self.keyframes.len() > window.len();
+        let older = self.learnable(0..if beyond { self.keyframes.len().saturating_sub(config.window.recent) } else { 0 });
+        let mut before = schedule::steps(&window, &older, unscored, &mut self.rng, &config.window);
         let mut after = before.split_off((density.after_share * unscored as f32).round() as usize);
         // Together where they are one batch: the host waits once.
         if !controlled {

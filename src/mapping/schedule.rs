@@ -7,9 +7,6 @@ use super::keyframe::MappedKeyframe;
 use crate::optimise::ErrorPixels;
 use crate::splat::model::Dropout;
 
-/// Older keyframes that are drawn before one of the window takes the place.
-const TRIES: usize = 32;
-
 /// Training view of a step.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Step {
@@ -41,19 +38,11 @@ pub(super) fn window(keyframes: &[MappedKeyframe], config: &WindowConfig) -> Vec
     window
 }
 
-/// So many steps over the window, newest first, of `len` keyframes; now and then any older one that `may` be learnt from, so that the map does not forget.
-pub(super) fn steps(
-    window: &[usize],
-    (len, may): (usize, &dyn Fn(usize) -> bool),
-    count: usize,
-    rng: &mut Rng,
-    config: &WindowConfig,
-) -> Vec<Step> {
-    let older = len.saturating_sub(config.recent);
+/// So many steps over the window, newest first; now and then one over any of the `older` keyframes, so that the map does not forget.
+pub(super) fn steps(window: &[usize], older: &[usize], count: usize, rng: &mut Rng, config: &WindowConfig) -> Vec<Step> {
     let draw = |taken: usize| {
-        let goes_back = len > window.len() && rng.f32() < config.older_share;
-        let drawn = if goes_back { (0..TRIES).map(|_| rng.usize(..older.max(1))).find(|k| may(*k)) } else { None };
-        Step::new(drawn.unwrap_or(window[taken % window.len()]))
+        let goes_back = !older.is_empty() && rng.f32() < config.older_share;
+        Step::new(if goes_back { older[rng.usize(..older.len())] } else { window[taken % window.len()] })
     };
     (0..count).map(draw).collect()
 }

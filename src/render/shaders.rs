@@ -104,4 +104,5 @@ shaders! {
     GATHER = "gather", "gather", [VIEW], ["main"];
     DIVIDE = "divide", "divide", [VIEW], ["main"];
     APPEND = "append", "append", [VIEW], ["main"];
+    FIX = "fix", "fix", [VIEW], ["main"];
 }

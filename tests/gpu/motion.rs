@@ -27,7 +27,7 @@ fn parameters_and_averages_move_and_moments_are_cleared() {
         map.append(&gpu, &cloud).unwrap();
         let elements = map.planes() * map.capacity();
         [map.moments_1(), map.moments_2()].iter().for_each(|moments| moments.write(&gpu, 0, &vec![[1.0f32; 4]; elements]));
-        let motion = RunMotion { run: MOVED, new_from_old: new_from_old() };
+        let motion = RunMotion { run: MOVED, new_from_old: new_from_old(), clears_moments: true };
         map.transform(&gpu, std::slice::from_ref(&motion)).unwrap();
         let moved = map.download(&gpu).unwrap();
         let values = |buffer: &keysplat::gpu::GpuBuffer| buffer.read::<[f32; 4]>(&gpu, 0, elements).unwrap();
@@ -63,7 +63,7 @@ fn the_moved_map_looks_the_same_from_the_moved_camera() {
     let mut rasterizer = Rasterizer::new(gpu.clone()).unwrap();
     let before = rasterizer.render(&map, &view, [0.0; 3]).unwrap();
     let new_from_old = new_from_old();
-    map.transform(&gpu, &[RunMotion { run: 0..cloud.len(), new_from_old }]).unwrap();
+    map.transform(&gpu, &[RunMotion { run: 0..cloud.len(), new_from_old, clears_moments: false }]).unwrap();
     // A camera keeps its unit: world_from_camera of the moved one is rigid.
     let camera_from_new = (Sim3::from(view.camera_from_world) * new_from_old.inverse()).to_rigid();
     let moved = ViewCamera { camera_from_world: camera_from_new, ..view };

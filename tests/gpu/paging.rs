@@ -8,6 +8,7 @@ use image::{Rgb, RgbImage};
 use keysplat::geometry::{Pinhole, Se3};
 use keysplat::gpu::Gpu;
 use keysplat::mapping::{Keyframe, Mapper, MappingConfig, MappingError, PoseUpdate};
+use keysplat::optimise::{AdamConfig, LossConfig, TargetImage, Trainer, TrainingView};
 use keysplat::render::{GpuCloud, MapRenderer, Plan};
 use keysplat::splat::model::Surface;
 use keysplat::splat::{GaussianCloud, ShDegree, ViewCamera};
@@ -84,6 +85,36 @@ fn what_was_copied_out_comes_back_as_it_was() {
     let bytes = out.to_bytes();
     assert_eq!(keysplat::render::CloudPart::from_bytes(&bytes, degree, 100), Some(out));
     assert_eq!(keysplat::render::CloudPart::from_bytes(&bytes[1..], degree, 100), None);
+}
+
+#[test]
+fn no_step_moves_what_is_fixed_until_it_is_free_again() {
+    let Some(gpu) = adapter() else { return };
+    let rng = &mut Rng::with_seed(3);
+    let degree = ShDegree::new(1).unwrap();
+    let mut map = GpuCloud::new(&gpu, degree, 90).unwrap();
+    map.append(&gpu, &crate::common::scene(rng, 90, degree)).unwrap();
+    let camera = crate::common::camera(rng, 48, 32);
+    let image = RgbImage::from_fn(48, 32, |_, _| Rgb([rng.u8(..), rng.u8(..), rng.u8(..)]));
+    let target = TargetImage::new(&gpu, &image, None).unwrap();
+    let mut trainer = Trainer::new(gpu.clone()).unwrap();
+    // How many of the Gaussians at these places steps move.
+    let mut moved = |map: &mut GpuCloud, places: &[u32]| {
+        let before = map.copy_out(&gpu, places).unwrap();
+        trainer.steps(map, &[TrainingView::new(camera, &target); 10], &LossConfig::default(), &AdamConfig::default()).unwrap();
+        let after = map.copy_out(&gpu, places).unwrap();
+        (0..places.len()).filter(|i| before.picked(&[*i]) != after.picked(&[*i])).count()
+    };
+    let (fixed, rest): (Vec<u32>, Vec<u32>) = (0..90).partition(|place| place % 3 == 1);
+    map.fix(&gpu, &fixed).unwrap();
+    assert_eq!(moved(&mut map, &fixed), 0);
+    assert!(moved(&mut map, &rest) > 20);
+    // They move up as the first of each three goes.
+    map.apply(&gpu, &Plan::removing((0..90).step_by(3).collect())).unwrap();
+    let moved_up: Vec<u32> = (0..60).step_by(2).collect();
+    assert_eq!(moved(&mut map, &moved_up), 0);
+    map.fix(&gpu, &[]).unwrap();
+    assert!(moved(&mut map, &moved_up) > 10);
 }
 
 #[test]

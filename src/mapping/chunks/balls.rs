@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use crate::geometry::Sim3;
 
 /// Gaussians of a group, at most.
-const PART: usize = 32;
+const PART: usize = 16;
 /// Beyond so many standard deviations, a Gaussian of a group adds little.
 const EXTENT: f32 = 1.0;
 

@@ -7,15 +7,15 @@ mod index;
 mod sight;
 mod store;
 
-use std::cell::Cell;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
+use std::sync::{Mutex, PoisonError};
 
 use serde::{Deserialize, Serialize};
 
 pub(super) use self::balls::{Ball, parts};
 use self::index::Index;
-pub(super) use self::sight::{Outlook, Sight};
+pub(super) use self::sight::{Hidden, Outlook, Sight};
 use self::store::{Store, Stored};
 use super::{KeyframeId, MappingError, anchors};
 use crate::geometry::Sim3;
@@ -73,7 +73,7 @@ pub(super) struct Chunks {
     index: Index,
     returned: Vec<Returned>,
     /// So many of these had come back before the last download, if there was any.
-    downloaded: Cell<Option<usize>>,
+    downloaded: Mutex<Option<usize>>,
     store: Store,
     /// Whether there are checkpoints.
     lasting: bool,
@@ -106,7 +106,7 @@ impl Chunks {
     }
 
     fn with(state: ChunksState, store: Store, lasting: bool) -> Self {
-        Self { index: state.index(), state, returned: Vec::new(), downloaded: Cell::default(), store, lasting }
+        Self { index: state.index(), state, returned: Vec::new(), downloaded: Mutex::default(), store, lasting }
     }
 
     /// What a checkpoint needs. The file is flushed to the disk.
@@ -126,13 +126,14 @@ impl Chunks {
 
     /// The Gaussians on the GPU have been downloaded. Returns which ones are away now; they stay on the disk until the next download.
     pub fn snapshot(&self) -> BTreeSet<ChunkId> {
-        self.downloaded.set(Some(self.returned.len()));
+        *self.downloaded.lock().unwrap_or_else(PoisonError::into_inner) = Some(self.returned.len());
         self.away()
     }
 
     fn reuse_places(&mut self) {
         let Self { returned, downloaded, store, .. } = self;
-        let before = downloaded.get_mut().as_mut().map_or(returned.len(), std::mem::take);
+        let downloaded = downloaded.get_mut().unwrap_or_else(PoisonError::into_inner);
+        let before = downloaded.as_mut().map_or(returned.len(), std::mem::take);
         returned[..before].iter_mut().for_each(|returned| returned.in_snapshot = false);
         returned.retain(|returned| {
             let is_kept = returned.in_snapshot || returned.in_checkpoint;
@@ -162,9 +163,13 @@ impl Chunks {
         self.state.away[&chunk].gaussians
     }
 
-    /// Whether a view sees nothing of what is away.
-    pub fn is_complete(&self, outlook: &Outlook<'_>) -> bool {
-        self.index.seen_by(outlook).next().is_none()
+    /// Where a view sees something that is away; nothing where it sees nothing of that.
+    pub fn hidden_from(&self, outlook: &Outlook<'_>) -> Option<Hidden> {
+        let mut seen = self.index.seen_by(outlook).peekable();
+        seen.peek()?;
+        let mut hidden = outlook.nothing_hidden();
+        seen.for_each(|(_, ball)| outlook.hide(ball, &mut hidden));
+        Some(hidden)
     }
 
     /// Chunks that a view sees, the nearest first.

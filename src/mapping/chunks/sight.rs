@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 use super::Ball;
 use crate::geometry::Pinhole;
 use crate::gpu::plain;
+use crate::optimise::Pixels;
 use crate::sequence::RectifiedImage;
 use crate::splat::ViewCamera;
 use crate::splat::model::NEAR_METRES;
@@ -69,16 +70,35 @@ pub(in crate::mapping) struct Outlook<'a> {
 impl Outlook<'_> {
     /// Whether a part of the ball lies in the image and not behind all that the image shows there.
     pub fn sees(&self, ball: &Ball) -> bool {
+        self.reaches(ball, |_| true)
+    }
+
+    /// Nothing of the image is hidden yet.
+    pub fn nothing_hidden(&self) -> Hidden {
+        Hidden { columns: self.sight.columns, blocks: vec![false; self.sight.farthest.len()] }
+    }
+
+    /// Where the ball is seen, the image counts as hidden.
+    pub fn hide(&self, ball: &Ball, hidden: &mut Hidden) {
+        let hide = |block: usize| {
+            hidden.blocks[block] = true;
+            false
+        };
+        self.reaches(ball, hide);
+    }
+
+    /// Goes through the blocks in which the ball is seen until `found` ends that; returns whether it did.
+    fn reaches(&self, ball: &Ball, mut found: impl FnMut(usize) -> bool) -> bool {
         let along = |axis: usize| self.axes[axis].dot(ball.center()) + self.translation[axis];
         let (z, radius) = (along(2), ball.radius());
-        if z + radius < NEAR_METRES as f32 {
+        if z + radius < NEAR_METRES as f32 || !self.is_within(along(0), along(1), z, radius) {
             return false;
         }
         let (columns, rows) = (self.sight.columns, self.sight.farthest.len() as u32 / self.sight.columns);
         let nearest = z - radius;
         if nearest < NEAR_METRES as f32 {
             // It surrounds the camera, or reaches through the image's plane: its outline says nothing.
-            return self.reaches(along(0), along(1), z, radius);
+            return (0..self.sight.farthest.len()).any(found);
         }
         // Within a ball, x/z differs from that of its middle by no more than r·√(z² + x²) / (z·(z - r)).
         let blocks = |center: f32, focal: f64, middle: f64, count: u32| {
@@ -91,17 +111,18 @@ impl Outlook<'_> {
         };
         let across = blocks(along(0), self.pinhole.fx, self.pinhole.cx, columns);
         let down = blocks(along(1), self.pinhole.fy, self.pinhole.cy, rows);
-        let reached = |row: u32| {
-            let line = &self.sight.farthest[(row * columns) as usize..][..columns as usize];
-            across.clone().any(|column| line[column as usize] * DEPTH_MARGIN >= nearest)
-        };
-        down.into_iter().any(reached)
+        down.into_iter().any(|row| {
+            let mut blocks = across.clone().map(|column| (row * columns + column) as usize);
+            blocks.any(|block| self.sight.farthest[block] * DEPTH_MARGIN >= nearest && found(block))
+        })
     }
 
     /// Whether the view may see a ball within this one: a coarser question than [`Self::sees`].
     pub fn faces(&self, ball: &Ball) -> bool {
-        let (z, radius) = (self.depth(ball), ball.radius());
-        z + radius >= NEAR_METRES as f32 && z - radius <= self.most * DEPTH_MARGIN
+        let along = |axis: usize| self.axes[axis].dot(ball.center()) + self.translation[axis];
+        let (z, radius) = (along(2), ball.radius());
+        let is_within_depth = z + radius >= NEAR_METRES as f32 && z - radius <= self.most * DEPTH_MARGIN;
+        is_within_depth && self.is_within(along(0), along(1), z, radius)
     }
 
     /// Depth of the ball's middle, metres.
@@ -109,14 +130,8 @@ impl Outlook<'_> {
         self.axes[2].dot(ball.center()) + self.translation[2]
     }
 
-    /// Distance of the ball's middle from the camera, metres.
-    pub fn distance(&self, ball: &Ball) -> f32 {
-        let along = |axis: usize| self.axes[axis].dot(ball.center()) + self.translation[axis];
-        Vec3::new(along(0), along(1), along(2)).length()
-    }
-
-    /// Whether a ball around the camera reaches into the pyramid of its view.
-    fn reaches(&self, x: f32, y: f32, z: f32, radius: f32) -> bool {
+    /// Whether a ball reaches into the pyramid of the view.
+    fn is_within(&self, x: f32, y: f32, z: f32, radius: f32) -> bool {
         let (columns, rows) = (self.sight.columns, self.sight.farthest.len() as u32 / self.sight.columns);
         let side = |center: f32, focal: f64, middle: f64, blocks: u32| {
             let slope = |pixel: f64| ((pixel - 0.5 - middle) / focal) as f32;
@@ -126,6 +141,34 @@ impl Outlook<'_> {
         };
         let Pinhole { fx, fy, cx, cy, .. } = self.pinhole;
         side(x, fx, cx, columns) && side(y, fy, cy, rows)
+    }
+}
+
+/// Blocks of an image that show something that is away.
+#[derive(Clone, Debug)]
+pub(in crate::mapping) struct Hidden {
+    columns: u32,
+    blocks: Vec<bool>,
+}
+
+impl Hidden {
+    /// Share of the image in which all is here, 0 to 1.
+    pub fn seen(&self) -> f32 {
+        self.blocks.iter().filter(|is_hidden| !**is_hidden).count() as f32 / self.blocks.len().max(1) as f32
+    }
+
+    /// Leaves out the pixels of an image so many pixels wide, of half the size if `halved`.
+    pub fn leave_out(&self, pixels: &mut Pixels, width: u32, halved: bool) {
+        let side = if halved { BLOCK / 2 } else { BLOCK };
+        let rows = pixels.color.chunks_mut(width as usize).zip(pixels.depth_metres.chunks_mut(width as usize));
+        for (y, (colors, depths)) in (0..).zip(rows) {
+            let line = &self.blocks[(y / side * self.columns) as usize..][..self.columns as usize];
+            for (x, (color, metres)) in (0..).zip(colors.iter_mut().zip(depths)) {
+                if line[(x / side) as usize] {
+                    (*color, *metres) = (0, 0.0);
+                }
+            }
+        }
     }
 }
 
@@ -169,7 +212,32 @@ mod tests {
             (true, ball(1.7, 0.0, 3.0, 0.4)),
         ] {
             assert_eq!(outlook.sees(&ball), seen, "{ball:?}");
+            assert!(!seen || outlook.faces(&ball), "{ball:?}");
+            let mut hidden = outlook.nothing_hidden();
+            outlook.hide(&ball, &mut hidden);
+            assert_eq!(hidden.seen() < 1.0, seen, "{ball:?}");
         }
+    }
+
+    #[test]
+    fn pixels_are_left_out_where_something_is_hidden() {
+        let (sight, camera) = sight();
+        let outlook = sight.from(&camera);
+        let mut hidden = outlook.nothing_hidden();
+        // In the opening, beside the wall and partly behind it.
+        outlook.hide(&ball(0.2, 0.0, 4.0, 0.4), &mut hidden);
+        let mut shares = Vec::new();
+        for (width, halved) in [(64, false), (32, true)] {
+            let count = (width * width * 3 / 4) as usize;
+            let mut pixels = Pixels { color: vec![7; count], depth_metres: vec![1.0; count] };
+            hidden.leave_out(&mut pixels, width, halved);
+            let is_left_out = |x: u32, y: u32| pixels.color[(y * width + x) as usize] == 0;
+            assert!(is_left_out(width * 9 / 16, width * 3 / 8) && !is_left_out(width * 7 / 16, width * 3 / 8));
+            assert!(!is_left_out(width * 9 / 16, 0) && !is_left_out(width - 1, width * 3 / 8));
+            assert!(pixels.color.iter().zip(&pixels.depth_metres).all(|(color, metres)| (*color == 0) == (*metres == 0.0)));
+            shares.push(pixels.color.iter().filter(|color| **color != 0).count() as f32 / count as f32);
+        }
+        assert_eq!(shares, [hidden.seen(); 2]);
     }
 
     #[test]

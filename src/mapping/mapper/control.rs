@@ -27,9 +27,10 @@ impl Mapper {
             self.density.prepare(&self.gpu, &density.setup(&self.map_size()))?;
             verdicts = self.trainer.over_scores(&self.density.verdicts(&self.gpu, &self.cloud))?;
         }
-        // What is frozen neither goes nor is divided.
+        // What is frozen or fixed neither goes nor is divided.
         let frozen = self.cloud.frozen();
         verdicts[..frozen].fill(VERDICT_KEEP);
+        self.anchors.fixed().for_each(|place| verdicts[place as usize] = VERDICT_KEEP);
         self.density.remember(&self.gpu, &self.cloud, self.trainer.scores());
         let before = self.cloud.len();
         let mut plan = density::plan(&verdicts, self.most_gaussians(), density);

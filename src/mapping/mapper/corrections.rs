@@ -22,9 +22,9 @@ impl Mapper {
                 motions.extend(motion.map(|motion| (keyframe.id, motion)));
             }
         }
-        let moved = self.anchors.moved(&motions);
+        // Optimisation takes along what it learns; what is fixed or away follows every update.
+        let moved = self.anchors.moved(&motions, &each);
         self.cloud.transform(&self.gpu, &moved)?;
-        // Optimisation takes along what is on the GPU; what is away follows every update.
         let away = self.chunks.transform(&each);
         Ok(away + moved.iter().map(|motion| motion.run.len()).sum::<usize>())
     }
@@ -41,8 +41,9 @@ impl Mapper {
             self.change(&Plan::removing(removed))?;
         }
         self.keyframes.retain(|keyframe| !keyframes.contains(&keyframe.id));
-        // Its entries are places among the keyframes.
+        // Their entries are places among the keyframes.
         self.epoch.clear();
+        self.learnable.clear();
         Ok(gaussians)
     }
 }

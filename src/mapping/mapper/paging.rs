@@ -1,36 +1,27 @@
-//! Which Gaussians are on the GPU. Before a keyframe is mapped, those that its window sees come back, and the farthest of the others leave. In the final
-//! refinement, neighbouring keyframes whose views fit the GPU are refined together for some epochs, then the next ones.
+//! Which Gaussians are on the GPU. Before a keyframe is mapped, those that its window sees come back; where there is no room, those leave that no
+//! keyframe near by sees.
 
 use std::collections::BTreeSet;
 
+use rayon::prelude::*;
+
 use super::Mapper;
-use crate::mapping::chunks::{Ball, ChunkId, Members, Outlook, parts};
+use crate::mapping::chunks::{Ball, ChunkId, Members, parts};
 use crate::mapping::{MappingError, schedule};
 use crate::render::{CloudPart, Plan};
 use crate::splat::GaussianCloud;
 
 /// Where Gaussians leave, a part in so many of the GPU's room becomes free, so that not at every keyframe some have to.
-const FREE_DIVISOR: usize = 8;
-/// Epochs of the final refinement over the keyframes of a stay.
-const EPOCHS_A_STAY: usize = 3;
+pub(super) const FREE_DIVISOR: usize = 8;
 
 /// Neighbouring Gaussians on the GPU.
-struct Group {
-    ball: Ball,
+pub(super) struct Group {
+    pub ball: Ball,
     /// In map order.
-    places: Vec<u32>,
+    pub places: Vec<u32>,
 }
 
 impl Mapper {
-    /// Keyframes of these that see nothing of what is away.
-    pub(super) fn complete(&self, keyframes: impl IntoIterator<Item = usize>) -> Vec<usize> {
-        keyframes.into_iter().filter(|k| self.is_complete(*k)).collect()
-    }
-
-    pub(super) fn is_complete(&self, k: usize) -> bool {
-        self.chunks.are_here() || self.chunks.is_complete(&self.keyframes[k].outlook())
-    }
-
     /// Brings what the newest keyframe and its window see onto the GPU, as far as there is room: what is nearest to the newest one first.
     pub(super) fn page_for_window(&mut self) -> Result<(), MappingError> {
         self.needing = schedule::window(&self.keyframes, &self.config.window);
@@ -39,7 +30,7 @@ impl Mapper {
         }
         self.page_in()?;
         let newest = self.keyframes.len() - 1;
-        if !self.is_short && !self.is_complete(newest) {
+        if !self.is_short && self.hidden(newest).is_some() {
             self.is_short = true;
             tracing::warn!(
                 "keyframe {} sees more Gaussians than the {} that the GPU has room for, and some keyframes are not learnt from; raise \
@@ -52,7 +43,7 @@ impl Mapper {
     }
 
     /// What the needing keyframes see comes back, in their order, until there is no more room.
-    fn page_in(&mut self) -> Result<(), MappingError> {
+    pub(super) fn page_in(&mut self) -> Result<(), MappingError> {
         let mut seen = BTreeSet::new();
         let mut wanted: Vec<ChunkId> = Vec::new();
         for k in &self.needing {
@@ -80,26 +71,49 @@ impl Mapper {
         Ok(())
     }
 
-    /// Where there is no room on the GPU for so many more Gaussians, those leave that no needing keyframe sees, the farthest first.
+    /// Where there is no room on the GPU for so many more Gaussians, images leave first, then Gaussians.
     pub(super) fn make_room(&mut self, more: usize) -> Result<(), MappingError> {
-        let most = self.most_on_gpu();
         let wanted = self.cloud.len() + more;
-        if wanted <= most || self.needing.is_empty() {
+        if wanted <= self.most_on_gpu() || self.needing.is_empty() {
             return Ok(());
         }
-        let excess = wanted - (most - most / FREE_DIVISOR);
-        let outlooks: Vec<Outlook<'_>> = self.needing.iter().map(|k| self.keyframes[*k].outlook()).collect();
-        let groups = self.groups()?.into_iter().filter(|group| !outlooks.iter().any(|outlook| outlook.sees(&group.ball)));
-        let mut groups: Vec<(f32, Group)> = groups.map(|group| (outlooks[0].distance(&group.ball), group)).collect();
-        groups.sort_by(|a, b| b.0.total_cmp(&a.0));
-        let mut freed = 0;
-        let leaves = |(_, group): &(f32, Group)| {
-            let leaves = freed < excess;
-            freed += group.places.len();
-            leaves
-        };
-        let leaving: Vec<Group> = groups.into_iter().take_while(leaves).map(|(_, group)| group).collect();
+        self.offload_images()?;
+        let most = self.most_on_gpu();
+        if wanted <= most {
+            return Ok(());
+        }
+        let room = (most - most / FREE_DIVISOR).saturating_sub(more);
+        let leaving = self.unseen(room)?;
         self.page_out(&leaving)
+    }
+
+    /// Groups on the GPU that neither a needing keyframe sees, nor one near the first of these: as many of the nearest as have room for what they see.
+    fn unseen(&self, room: usize) -> Result<Vec<Group>, MappingError> {
+        let mut unseen = self.groups()?;
+        let mut kept = self.cloud.frozen();
+        let near = self.keyframes_near(self.needing[0]);
+        for (rank, k) in self.needing.iter().chain(&near).enumerate() {
+            let outlook = self.keyframes[*k].outlook();
+            let is_seen: Vec<bool> = unseen.par_iter().map(|group| outlook.sees(&group.ball)).collect();
+            let seen = unseen.iter().zip(&is_seen).filter(|(_, is_seen)| **is_seen);
+            kept += seen.map(|(group, _)| group.places.len()).sum::<usize>();
+            if kept > room && rank >= self.needing.len() {
+                break;
+            }
+            let mut is_seen = is_seen.into_iter();
+            unseen.retain(|_| is_seen.next() == Some(false));
+        }
+        Ok(unseen)
+    }
+
+    /// Images that no needing keyframe has leave the GPU first: a step that uses one uploads it, but Gaussians are learnt only where there is room.
+    fn offload_images(&mut self) -> Result<(), MappingError> {
+        let leaving =
+            self.keyframes.iter_mut().enumerate().filter(|(k, keyframe)| keyframe.is_resident() && !self.needing.contains(k));
+        for (_, keyframe) in leaving {
+            keyframe.offload(&self.gpu, &mut self.images)?;
+        }
+        Ok(())
     }
 
     /// Gaussians leave the GPU for the disk.
@@ -119,7 +133,7 @@ impl Mapper {
     }
 
     /// All Gaussians on the GPU that may leave it.
-    fn groups(&self) -> Result<Vec<Group>, MappingError> {
+    pub(super) fn groups(&self) -> Result<Vec<Group>, MappingError> {
         let first = self.cloud.frozen();
         let extents = self.cloud.extents(&self.gpu, first)?;
         let group = |part: Vec<usize>| Group {
@@ -127,54 +141,6 @@ impl Mapper {
             places: part.into_iter().map(|i| (first + i) as u32).collect(),
         };
         Ok(parts(&extents).into_iter().map(group).collect())
-    }
-
-    /// The keyframes of the next stay of the final refinement, [`EPOCHS_A_STAY`] times each, after what they see has come to the GPU; none where no view
-    /// fits it.
-    pub(super) fn next_stay(&mut self) -> Result<Vec<usize>, MappingError> {
-        for _ in 0..self.keyframes.len() {
-            let fewest = self.visits.iter().copied().min().unwrap_or(0);
-            let due: Vec<usize> = (0..self.keyframes.len()).filter(|k| self.visits[*k] == fewest).collect();
-            self.needing = self.fitting(&due)?;
-            self.page_in()?;
-            let mut stay = self.complete(due.iter().copied());
-            // One that sees more than fits is left out of this round of visits.
-            let visited = if stay.is_empty() { &due[..1] } else { &stay[..] };
-            visited.iter().for_each(|k| self.visits[*k] += EPOCHS_A_STAY as u32);
-            tracing::debug!(keyframes = stay.len(), due = due.len(), resident = self.cloud.len(), "stay");
-            if !stay.is_empty() {
-                let mut epochs = Vec::with_capacity(stay.len() * EPOCHS_A_STAY);
-                for _ in 0..EPOCHS_A_STAY {
-                    self.rng.shuffle(&mut stay);
-                    epochs.extend_from_slice(&stay);
-                }
-                return Ok(epochs);
-            }
-        }
-        Ok(Vec::new())
-    }
-
-    /// The first of these keyframes, as many as have room for what they see on the GPU beside each other.
-    fn fitting(&self, keyframes: &[usize]) -> Result<Vec<usize>, MappingError> {
-        let room = self.most_on_gpu() - self.most_on_gpu() / FREE_DIVISOR;
-        let groups = self.groups()?;
-        let (mut here, mut away) = (vec![false; groups.len()], BTreeSet::new());
-        let mut gaussians = self.cloud.frozen();
-        let mut fitting = Vec::new();
-        for k in keyframes {
-            let outlook = self.keyframes[*k].outlook();
-            for (group, is_counted) in groups.iter().zip(&mut here).filter(|(_, is_counted)| !**is_counted) {
-                *is_counted = outlook.sees(&group.ball);
-                gaussians += if *is_counted { group.places.len() } else { 0 };
-            }
-            let new = self.chunks.seen_by(&outlook).into_iter().filter(|chunk| away.insert(*chunk));
-            gaussians += new.map(|chunk| self.chunks.gaussians(chunk)).sum::<usize>();
-            if gaussians > room && !fitting.is_empty() {
-                break;
-            }
-            fitting.push(*k);
-        }
-        Ok(fitting)
     }
 
     /// Adds what was on the disk to a map that was downloaded at the same time.

@@ -135,7 +135,7 @@ impl Mapper {
             }
             let Some(keyframe) = self.epoch.pop() else { break };
             // Chunks may have left since the epoch began.
-            if self.is_complete(keyframe) {
+            if self.is_learnable(keyframe) {
                 steps.push(Step { coarse, ..Step::new(keyframe) });
             }
         }
@@ -144,11 +144,11 @@ impl Mapper {
 
     /// Keyframes in the order in which steps learn from them, the last first.
     fn next_epoch(&mut self) -> Result<Vec<usize>, MappingError> {
-        if !self.visits.is_empty() && !self.chunks.are_here() {
-            return self.next_stay();
+        let stays = !self.visits.is_empty() && !self.chunks.are_here();
+        let mut epoch = if stays { self.next_stay()? } else { self.learnable(self.views()) };
+        if !stays {
+            self.rng.shuffle(&mut epoch);
         }
-        let mut epoch = self.complete(self.views());
-        self.rng.shuffle(&mut epoch);
         Ok(epoch)
     }
 
@@ -175,6 +175,8 @@ impl Mapper {
             None => config.steps.max(config.final_epochs * self.keyframes.len()),
         };
         let started = config.seconds.map(|_| Instant::now());
+        // Each Gaussian's own views get their turn.
+        self.fix(&[])?;
         self.epoch.clear();
         self.visits = vec![0; self.keyframes.len()];
         let mut warm_up = 0;
@@ -236,7 +238,7 @@ impl Mapper {
         density: &DensityConfig,
         adam: &AdamConfig,
     ) -> Result<(usize, usize), MappingError> {
-        let mut views = self.complete(self.views());
+        let mut views = self.learnable(self.views());
         let count = views.len();
         views.rotate_left(refinement.rounds % count.max(1));
         refinement.rounds += 1;

@@ -23,6 +23,7 @@ pub struct MapperState {
     trainer: TrainerState,
     anchors: Anchors,
     chunks: ChunksState,
+    learnable: Vec<usize>,
     visits: Vec<u32>,
     stepped_capacity: usize,
     keyframes: Vec<KeyframeState>,
@@ -45,6 +46,7 @@ impl Mapper {
             trainer: self.trainer.state(),
             anchors: self.anchors.clone(),
             chunks: self.chunks.state()?,
+            learnable: self.learnable.clone(),
             visits: self.visits.clone(),
             stepped_capacity: self.stepped_capacity,
             keyframes: self.keyframes.iter().map(|keyframe| keyframe.state(&self.gpu, &self.images)).collect::<Result<_, _>>()?,
@@ -79,6 +81,7 @@ impl Mapper {
             mapper.density.reserve(&mapper.gpu, state.trainer.scored() as u32)?;
         }
         mapper.anchors = state.anchors.clone();
+        mapper.learnable = state.learnable.clone();
         mapper.visits = state.visits.clone();
         mapper.stepped_capacity = state.stepped_capacity;
         mapper.rng = Rng::with_seed(state.rng);

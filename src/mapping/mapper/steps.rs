@@ -1,10 +1,14 @@
 //! Steps, a batch at a time, and the scores that come with some of them.
 
+use std::borrow::Cow;
 use std::time::Instant;
 
 use super::{BATCH, Interlude, Mapper, Step, YIELDING_BATCH};
+use crate::mapping::chunks::Hidden;
+use crate::mapping::image_store::ImageStore;
+use crate::mapping::keyframe::MappedKeyframe;
 use crate::mapping::{DensityConfig, MappingError};
-use crate::optimise::{AdamConfig, OverScores, TrainingView};
+use crate::optimise::{AdamConfig, OverScores, Pixels, TrainingView};
 
 impl Mapper {
     /// Takes steps, in batches, until `interlude` ends them.
@@ -49,8 +53,15 @@ impl Mapper {
         adam: &AdamConfig,
         judged: Option<&DensityConfig>,
     ) -> Result<(Taken, Vec<u32>), MappingError> {
-        let streamed = batch.iter().map(|step| self.keyframes[step.keyframe].streamed(step.coarse, &self.images));
-        let streamed = streamed.collect::<Result<Vec<_>, _>>()?;
+        let hidden: Vec<Option<Hidden>> = batch.iter().map(|step| self.hidden(step.keyframe)).collect();
+        for (step, _) in batch.iter().zip(&hidden).filter(|(_, hidden)| hidden.is_some()) {
+            self.keyframes[step.keyframe].offload(&self.gpu, &mut self.images)?;
+        }
+        let streamed = batch
+            .iter()
+            .zip(hidden)
+            .map(|(step, hidden)| streamed(&self.keyframes[step.keyframe], step.coarse, hidden, &self.images));
+        let streamed = streamed.collect::<std::io::Result<Vec<_>>>()?;
         let views = batch.iter().zip(&streamed).map(|(step, pixels)| {
             let keyframe = &self.keyframes[step.keyframe];
             let view = keyframe.view(step.coarse);
@@ -77,6 +88,21 @@ impl Mapper {
         }
         Ok((taken, verdicts))
     }
+}
+
+/// Pixels of a view whose image is not on the GPU, without those in which something is hidden.
+fn streamed<'a>(
+    keyframe: &'a MappedKeyframe,
+    coarse: bool,
+    hidden: Option<Hidden>,
+    images: &ImageStore,
+) -> std::io::Result<Option<Cow<'a, Pixels>>> {
+    let mut pixels = keyframe.streamed(coarse, images)?;
+    if let (Some(pixels), Some(hidden)) = (&mut pixels, hidden) {
+        let width = keyframe.view(coarse).camera.pinhole.width;
+        hidden.leave_out(pixels.to_mut(), width, width < keyframe.camera.pinhole.width);
+    }
+    Ok(pixels)
 }
 
 /// Steps taken.

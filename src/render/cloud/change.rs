@@ -4,7 +4,7 @@ use glam::Vec3;
 
 use super::{GEOMETRY_PLANES, GpuCloud, allocate, allocate_histories, planes};
 use crate::gpu::{Gpu, GpuBuffer, GpuError, Kernel, UniformCell, Uniforms, workgroups};
-use crate::render::layout::{AppendSetup, BlendForm, DivideSetup, GatherSetup};
+use crate::render::layout::{AppendSetup, BlendForm, DivideSetup, FixSetup, GatherSetup};
 use crate::render::plan::Plan;
 use crate::render::shaders::{self, ShaderSource};
 use crate::splat::GaussianCloud;
@@ -14,12 +14,14 @@ pub(super) struct Kernels {
     gather: Kernel,
     divide: Kernel,
     append: Kernel,
+    fix: Kernel,
 }
 
 impl Kernels {
     pub fn new(gpu: &Gpu) -> Self {
         let kernel = |source: &ShaderSource| Kernel::new(gpu, source.name, "main", &source.text(BlendForm::default()));
-        Self { gather: kernel(&shaders::GATHER), divide: kernel(&shaders::DIVIDE), append: kernel(&shaders::APPEND) }
+        let [gather, divide, append, fix] = [&shaders::GATHER, &shaders::DIVIDE, &shaders::APPEND, &shaders::FIX].map(kernel);
+        Self { gather, divide, append, fix }
     }
 }
 
@@ -106,6 +108,23 @@ impl GpuCloud {
         dispatch(gpu, &self.kernels.append, &bindings, finite.len() as u32);
         self.count += finite.len();
         Ok(left_out)
+    }
+
+    /// The Gaussians at these places are rendered, but no step moves them, until the next such call. Their children, and where they go, keep that.
+    ///
+    /// # Errors
+    /// [`GpuError`] if a buffer does not fit.
+    pub fn fix(&mut self, gpu: &Gpu, places: &[u32]) -> Result<(), GpuError> {
+        let mut bits = vec![0u32; self.count.div_ceil(32).max(1)];
+        places.iter().for_each(|place| bits[*place as usize / 32] |= 1 << (place % 32));
+        let fixed = GpuBuffer::storage(gpu, "fixed", (bits.len() * 4) as u64)?;
+        fixed.write(gpu, 0, &bits);
+        self.uniforms.begin();
+        let setup = self.uniforms.put(&FixSetup { count: self.count as u32, capacity: self.capacity as u32, pad: [0; 2] });
+        self.uniforms.upload(gpu);
+        let bindings = [(0, self.uniforms.of(setup)), (1, &fixed), (2, &self.moments_2)];
+        dispatch(gpu, &self.kernels.fix, &bindings, self.count as u32);
+        Ok(())
     }
 
     /// Makes room for so many Gaussians.

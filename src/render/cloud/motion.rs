@@ -18,10 +18,12 @@ pub struct RunMotion {
     pub run: Range<usize>,
     /// Motion in the world.
     pub new_from_old: Sim3,
+    /// Whether their moments belong to where they were.
+    pub clears_moments: bool,
 }
 
 impl GpuCloud {
-    /// Moves runs of Gaussians, ascending, and clears their moments, which belong to where they were.
+    /// Moves runs of Gaussians, ascending.
     ///
     /// # Errors
     /// [`GpuError`] if a buffer does not fit or the device fails.
@@ -34,14 +36,14 @@ impl GpuCloud {
             let read = gpu.read(None, &parts)?;
             let mut planes: Vec<Vec<[f32; 4]>> = (0..self.planes()).map(|plane| read.part(plane)).collect();
             drop(read);
-            for RunMotion { run, new_from_old } in motions {
+            for RunMotion { run, new_from_old, .. } in motions {
                 let run = run.start - span.start..run.end - span.start;
                 move_planes(&mut planes.iter_mut().map(|plane| &mut plane[run.clone()]).collect::<Vec<_>>(), new_from_old);
             }
             planes.iter().enumerate().for_each(|(plane, values)| buffer.write(gpu, place(plane), values));
         }
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
-        for RunMotion { run, .. } in motions {
+        for RunMotion { run, .. } in motions.iter().filter(|motion| motion.clears_moments) {
             for plane in 0..self.planes() {
                 let (from, bytes) = ((plane * self.capacity + run.start) * 16, run.len() * 16);
                 for moments in [&self.moments_1, &self.moments_2] {

@@ -166,6 +166,15 @@ host_twins! {
         /// Round of density control in which they come.
         round: f32,
     }
+    /// Gaussians that no step moves (`shaders/fix.wgsl`).
+    FixSetup {
+        /// Gaussians in the map.
+        count: u32,
+        /// Gaussians that a plane has space for.
+        capacity: u32,
+        /// Fills a vec4.
+        pad: [u32; 2],
+    }
     /// Rules of density control (`shaders/shared/density.wgsl`).
     #[derive(PartialEq)]
     DensitySetup {
