@@ -172,6 +172,15 @@ impl Chunks {
         Some(hidden)
     }
 
+    /// Whether all is here that this share of a view's image shows.
+    pub fn is_here(&self, outlook: &Outlook<'_>, share: f32) -> bool {
+        let mut hidden = outlook.nothing_hidden();
+        self.index.seen_by(outlook).all(|(_, ball)| {
+            outlook.hide(ball, &mut hidden);
+            hidden.seen() >= share
+        })
+    }
+
     /// Chunks that a view sees, the nearest first.
     pub fn seen_by(&self, outlook: &Outlook<'_>) -> Vec<ChunkId> {
         let mut seen: Vec<(f32, ChunkId)> = self.index.seen_by(outlook).map(|(id, ball)| (outlook.depth(ball), id)).collect();

@@ -75,13 +75,14 @@ impl Outlook<'_> {
 
     /// Nothing of the image is hidden yet.
     pub fn nothing_hidden(&self) -> Hidden {
-        Hidden { columns: self.sight.columns, blocks: vec![false; self.sight.farthest.len()] }
+        let blocks = self.sight.farthest.len();
+        Hidden { columns: self.sight.columns, blocks: vec![false; blocks], left: blocks }
     }
 
     /// Where the ball is seen, the image counts as hidden.
     pub fn hide(&self, ball: &Ball, hidden: &mut Hidden) {
         let hide = |block: usize| {
-            hidden.blocks[block] = true;
+            hidden.left -= usize::from(!std::mem::replace(&mut hidden.blocks[block], true));
             false
         };
         self.reaches(ball, hide);
@@ -149,12 +150,14 @@ impl Outlook<'_> {
 pub(in crate::mapping) struct Hidden {
     columns: u32,
     blocks: Vec<bool>,
+    /// Of these, so many show nothing that is away.
+    left: usize,
 }
 
 impl Hidden {
     /// Share of the image in which all is here, 0 to 1.
     pub fn seen(&self) -> f32 {
-        self.blocks.iter().filter(|is_hidden| !**is_hidden).count() as f32 / self.blocks.len().max(1) as f32
+        self.left as f32 / self.blocks.len().max(1) as f32
     }
 
     /// Leaves out the pixels of an image so many pixels wide, of half the size if `halved`.

@@ -11,7 +11,7 @@ use crate::mapping::chunks::{Hidden, Outlook};
 /// Share of an image that steps learn from at least.
 const LEAST_SEEN: f32 = 0.5;
 /// Keyframes near by that are looked at, so that the work for a keyframe does not grow with the map.
-const NEAR: usize = 256;
+const NEAR: usize = 128;
 
 impl Mapper {
     /// Keyframes of these that steps can learn from.
@@ -51,8 +51,7 @@ impl Mapper {
         near.sort_unstable();
         near.dedup();
         let (keyframes, chunks) = (&self.keyframes, &self.chunks);
-        let is_learnable =
-            |k: &usize| chunks.hidden_from(&keyframes[*k].outlook()).is_none_or(|hidden| hidden.seen() >= LEAST_SEEN);
+        let is_learnable = |k: &usize| chunks.is_here(&keyframes[*k].outlook(), LEAST_SEEN);
         self.learnable = near.into_par_iter().filter(is_learnable).collect();
     }
 
