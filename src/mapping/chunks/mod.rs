@@ -1,4 +1,4 @@
-//! Out-of-core mapping: Gaussians that no keyframe of the window sees leave the GPU for the disk, and come back when one does, as in DiskChunGS.
+//! Out-of-core mapping: Gaussians that no keyframe near by sees leave the GPU for the disk, and come back when one does, as in DiskChunGS.
 //!
 //! A chunk is a few dozen neighbours, divided anew each time Gaussians leave. A ball around it says which keyframes see it.
 
