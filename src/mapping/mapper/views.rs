@@ -11,7 +11,7 @@ use crate::mapping::chunks::{Hidden, Outlook};
 /// Share of an image that steps learn from at least.
 const LEAST_SEEN: f32 = 0.5;
 /// Keyframes near by that are looked at, so that the work for a keyframe does not grow with the map.
-const NEAR: usize = 128;
+const NEAR: usize = 256;
 
 impl Mapper {
     /// Keyframes of these that steps can learn from.
