@@ -53,6 +53,7 @@ fn is_wanted(i: u32) -> bool {
     return i >= adam.frozen && moments_2[view.capacity + i].w == 0.0;
 }
 
+// In the second moments, lane w of plane 1 marks a fixed Gaussian (`fix`).
 // In the first moments, lane w of planes 1 and 3 counts the Gaussian's steps, of all and of its higher harmonics.
 fn begin_gradient(i: u32, interval: f32) {
     sampling_interval = interval;

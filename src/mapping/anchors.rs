@@ -1,4 +1,4 @@
-//! The keyframe that each Gaussian was inserted from: when a closed loop moves a keyframe, its Gaussians go with it.
+//! The keyframe that each Gaussian was inserted from, and whether steps move it: when a closed loop moves a keyframe, its Gaussians go with it.
 
 use std::collections::{BTreeMap, BTreeSet};
 
