@@ -14,11 +14,13 @@ const GAUSSIANS: [usize; 4] = [10_000, 110_000, 500_000, 2_000_000];
 const SIZES: [(u32, u32); 3] = [(320, 240), (640, 480), (1200, 680)];
 const DEGREES: [u8; 3] = [0, 1, 3];
 /// Stages that are worth a benchmark of their own; the others are a few percent together.
-const STAGES: [&str; 9] = [
+const STAGES: [&str; 11] = [
     "project_forward",
     "sort_scatter",
-    "tile_lists",
-    "rasterize_forward",
+    "tile_lists_wide",
+    "tile_lists_narrow",
+    "rasterize_forward_wide",
+    "rasterize_forward_narrow",
     "loss_forward",
     "loss_backward",
     "rasterize_backward_wide",

@@ -8,65 +8,78 @@
 @group(0) @binding(4) var<storage, read> target_depth: array<f32>;
 // [3 channels, bordered windows along y, along x], zero where there is no window.
 @group(0) @binding(5) var<storage, read> partials: array<vec4<f32>>;
-// [2, H, W] plane 0 (r, g, b, Σ w z), plane 1 (alpha; mean |colour error|, for the scores; -, -).
+// [2, H, W] plane 0 (r, g, b, Σ w z), plane 1 (alpha; mean |colour error|, for the scores; HIDDEN_GRADIENT where the pixel is hidden; -).
 @group(0) @binding(6) var<storage, read_write> image_gradients: array<vec4<f32>>;
 
-// (by mean, by square, by product) of one channel filtered along rows: [13 rows of windows, 16 columns].
+// (by mean, by square, by product) of one channel filtered along rows: [13 rows of windows, 4 columns of each 4, of these the first, the second…].
 var<workgroup> rows: array<vec4<f32>, 208>;
 
-// A workgroup covers 16×16 pixels.
+// A workgroup covers 16×16 pixels, and an invocation four of one column. What is computed of these lies side by side in a vector.
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_index) local: u32) {
-    // Four pixels of one column.
-    let column = local % 16u;
-    let row = local / 16u * 4u;
-    let x = workgroup.x * 16u + column;
-    let y = workgroup.y * 16u + row;
-    let pixels = setup.width * setup.height;
-    let per_pixel = 1.0 / f32(pixels);
-    let end = select(0u, min(4u, setup.height - min(y, setup.height)), x < setup.width);
-    var gradient: array<vec4<f32>, 4>;
-    var rendered: array<vec4<f32>, 4>;
-    var wanted: array<vec4<f32>, 4>;
-    for (var k = 0u; k < end; k++) {
-        rendered[k] = color_depth[(y + k) * setup.width + x];
-        // A is 0 where nothing was recorded.
-        wanted[k] = wanted_pixel(target_color[(y + k) * setup.width + x]);
-    }
-    for (var channel = 0u; channel < 3u; channel++) {
-        let stride = bordered_windows(setup.width);
-        // The first windows that reach the first pixels.
-        let corner = vec2(workgroup.x * 8u + 1u - setup.phase_x, workgroup.y * 8u + 1u - setup.phase_y);
-        workgroupBarrier();
-        if local < 52u {
-            let begin = (channel * bordered_windows(setup.height) + corner.y + local / 4u) * stride + corner.x + local % 4u * 2u;
-            filter_row(begin, local * 4u);
-        }
-        workgroupBarrier();
-        let filtered = filter_column(local / 16u * 32u + column);
-        for (var k = 0u; k < end; k++) {
-            let ssim = dot(filtered.at[k].xyz, vec3(1.0, 2.0 * rendered[k][channel], wanted[k][channel]));
-            let l1 = sign(rendered[k][channel] - wanted[k][channel]);
-            let by_color = (1.0 - setup.ssim_weight) * l1 - setup.ssim_weight * setup.pixels_per_window * ssim;
-            gradient[k][channel] = wanted[k].w * by_color * per_pixel / 3.0;
-        }
-    }
-    for (var k = 0u; k < end; k++) {
-        let index = (y + k) * setup.width + x;
-        var gradient_alpha = 0.0;
-        let measured = target_depth[index];
-        if setup.depth_weight > 0.0 && measured > 0.0 {
-            let residual = rendered[k].w - (1.0 - bitcast<f32>(state[index].x)) * measured;
-            gradient[k].w = sign(residual) * setup.depth_weight * depth_precision(measured) * per_pixel;
-            gradient_alpha = -gradient[k].w * measured;
-        }
-        image_gradients[index] = gradient[k];
-        let error = wanted[k].w * abs(rendered[k].xyz - wanted[k].xyz);
-        image_gradients[pixels + index] = vec4(gradient_alpha, (error.x + error.y + error.z) / 3.0, 0.0, 0.0);
+    let x = workgroup.x * 16u + local % 16u;
+    let y = workgroup.y * 16u + local / 16u * 4u;
+    let per_pixel = 1.0 / f32(setup.width * setup.height);
+    // Beyond the image is the last pixel; nothing of it is stored.
+    let at = min(vec4(y) + vec4(0u, 1u, 2u, 3u), vec4(setup.height - 1u)) * setup.width + min(x, setup.width - 1u);
+    let rendered = transpose(mat4x4(color_depth[at.x], color_depth[at.y], color_depth[at.z], color_depth[at.w]));
+    // A is 0 where nothing was recorded.
+    let wanted = transpose(mat4x4(
+        wanted_pixel(target_color[at.x]),
+        wanted_pixel(target_color[at.y]),
+        wanted_pixel(target_color[at.z]),
+        wanted_pixel(target_color[at.w]),
+    ));
+    let measured = vec4(target_depth[at.x], target_depth[at.y], target_depth[at.z], target_depth[at.w]);
+    let final_states = vec4(state[at.x].x, state[at.y].x, state[at.z].x, state[at.w].x);
+    let residual = rendered[3] - (1.0 - bitcast<vec4<f32>>(final_states)) * measured;
+    let trust = vec4(depth_precision(measured.x), depth_precision(measured.y), depth_precision(measured.z), depth_precision(measured.w));
+    let is_measured = vec4(setup.depth_weight > 0.0) & (measured > vec4(0.0));
+    let by_depth = select(vec4(0.0), sign(residual) * setup.depth_weight * trust * per_pixel, is_measured);
+    let by_alpha = -by_depth * measured;
+    let share = wanted[3] * per_pixel / 3.0;
+    let gradient = transpose(mat4x4(
+        share * by_channel(0u, workgroup.xy, local, rendered[0], wanted[0]),
+        share * by_channel(1u, workgroup.xy, local, rendered[1], wanted[1]),
+        share * by_channel(2u, workgroup.xy, local, rendered[2], wanted[2]),
+        by_depth,
+    ));
+    let error = wanted[3] * (abs(rendered[0] - wanted[0]) + abs(rendered[1] - wanted[1]) + abs(rendered[2] - wanted[2])) / 3.0;
+    store(x, y, gradient[0], by_alpha.x, error.x);
+    store(x, y + 1u, gradient[1], by_alpha.y, error.y);
+    store(x, y + 2u, gradient[2], by_alpha.z, error.z);
+    store(x, y + 3u, gradient[3], by_alpha.w, error.w);
+}
+
+fn store(x: u32, y: u32, gradient: vec4<f32>, by_alpha: f32, error: f32) {
+    if x < setup.width && y < setup.height {
+        let at = y * setup.width + x;
+        image_gradients[at] = gradient;
+        let hidden = select(0.0, HIDDEN_GRADIENT, target_color[at] == HIDDEN);
+        image_gradients[setup.width * setup.height + at] = vec4(by_alpha, error, hidden, 0.0);
     }
 }
 
-// Four pixels of a row, from the windows at `at` on, to `rows[to]` on.
+// Of one channel, what L1 and SSIM say of four pixels of a column.
+fn by_channel(channel: u32, group: vec2<u32>, local: u32, rendered: vec4<f32>, wanted: vec4<f32>) -> vec4<f32> {
+    let stride = bordered_windows(setup.width);
+    // The first windows that reach the first pixels.
+    let corner = group * 8u + 1u - vec2(setup.phase_x, setup.phase_y);
+    workgroupBarrier();
+    if local < 52u {
+        let begin = (channel * bordered_windows(setup.height) + corner.y + local / 4u) * stride + corner.x + local % 4u * 2u;
+        filter_row(begin, local / 4u * 16u + local % 4u);
+    }
+    workgroupBarrier();
+    let filtered = filter_column(local / 16u * 32u + local % 4u * 4u + local % 16u / 4u);
+    let by_mean = vec4(filtered.a.x, filtered.b.x, filtered.c.x, filtered.d.x);
+    let by_square = vec4(filtered.a.y, filtered.b.y, filtered.c.y, filtered.d.y);
+    let by_product = vec4(filtered.a.z, filtered.b.z, filtered.c.z, filtered.d.z);
+    let ssim = by_mean + 2.0 * rendered * by_square + wanted * by_product;
+    return (1.0 - setup.ssim_weight) * sign(rendered - wanted) - setup.ssim_weight * setup.pixels_per_window * ssim;
+}
+
+// Four pixels of a row, from the windows at `at` on, to `rows[to]`, and each fourth one on.
 fn filter_row(at: u32, to: u32) {
     var sum: Filtered;
     if setup.phase_x == 0u {
@@ -86,9 +99,10 @@ fn filter_row(at: u32, to: u32) {
         add(&sum, partials[at + 5u], O5);
         add(&sum, partials[at + 6u], O6);
     }
-    for (var k = 0u; k < 4u; k++) {
-        rows[to + k] = sum.at[k];
-    }
+    rows[to] = sum.a;
+    rows[to + 4u] = sum.b;
+    rows[to + 8u] = sum.c;
+    rows[to + 12u] = sum.d;
 }
 
 // Four pixels of a column, from the row of windows at `at` on.

@@ -5,7 +5,7 @@
 // [H, W] rendered (r, g, b, Σ w z); (bits of the transmittance, -).
 @group(0) @binding(1) var<storage, read> color_depth: array<vec4<f32>>;
 @group(0) @binding(2) var<storage, read> state: array<vec2<u32>>;
-// [H, W] the keyframe: 8-bit RGBA, all 0 where nothing was recorded; and sensor depth in metres (0: not measured).
+// [H, W] the keyframe: 8-bit RGBA, all 0 where nothing was recorded, HIDDEN where it shows what is away; and sensor depth in metres (0: not measured).
 @group(0) @binding(3) var<storage, read> target_color: array<u32>;
 @group(0) @binding(4) var<storage, read> target_depth: array<f32>;
 // [3 channels, bordered windows along y, along x] ∂SSIM/∂(mean, mean square, mean product), zero where there is no window.
@@ -16,8 +16,8 @@
 const C1: f32 = 0.0001;
 const C2: f32 = 0.0009;
 
-// One channel filtered along rows: [25 rows, 8 windows].
-var<workgroup> rows: array<vec4<f32>, 200>;
+// One channel filtered along columns: [8 windows, 13 even columns, 13 odd ones], so that windows side by side read side by side.
+var<workgroup> columns: array<vec4<f32>, 208>;
 var<workgroup> sums: array<vec4<f32>, 64>;
 
 struct Ssim {
@@ -42,19 +42,24 @@ fn main(
     let to = (first.y / 2u + window.y + WINDOW_BORDER) * stride + first.x / 2u + window.x + WINDOW_BORDER;
     let center = first + 2u * window + vec2(setup.phase_x, setup.phase_y);
     let is_inside = center.x < setup.width && center.y < setup.height;
-    let is_recorded = target_color[select(0u, center.y * setup.width + center.x, is_inside)] != 0u;
-    let weight = select(0.0, 1.0, is_inside && is_recorded);
+    let is_seen = is_recorded(target_color[select(0u, center.y * setup.width + center.x, is_inside)]);
+    let weight = select(0.0, 1.0, is_inside && is_seen);
     var sum = vec4(0.0);
-    for (var channel = 0u; channel < 3u; channel++) {
-        workgroupBarrier();
-        if local < 50u {
-            filter_row(first, channel, local / 2u, local % 2u * 4u);
-        }
-        workgroupBarrier();
-        let ssim = ssim_of(filter_column(window.y * 16u + window.x));
-        partials[channel * plane + to] = weight * vec4(ssim.by_mean, ssim.by_square, ssim.by_product, 0.0);
-        sum.y += select(0.0, setup.pixels_per_window * select(1.0, ssim.value, is_recorded), is_inside);
+    var red: Filtered;
+    var green: Filtered;
+    var blue: Filtered;
+    if local < 50u {
+        filter_column(first, local % 25u, local / 25u * 4u, &red, &green, &blue);
     }
+    let at = window.y * 26u + window.x;
+    let by_red = filter_rows(local, at, red);
+    partials[to] = weight * vec4(by_red.by_mean, by_red.by_square, by_red.by_product, 0.0);
+    let by_green = filter_rows(local, at, green);
+    partials[plane + to] = weight * vec4(by_green.by_mean, by_green.by_square, by_green.by_product, 0.0);
+    let by_blue = filter_rows(local, at, blue);
+    partials[2u * plane + to] = weight * vec4(by_blue.by_mean, by_blue.by_square, by_blue.by_product, 0.0);
+    let ssim = by_red.value + by_green.value + by_blue.value;
+    sum.y = select(0.0, setup.pixels_per_window * select(3.0, ssim, is_seen), is_inside);
     // Four pixels of one column.
     let x = first.x + local % 16u;
     let y = first.y + local / 16u * 4u;
@@ -90,51 +95,77 @@ fn quantities(x: f32, y: f32) -> vec4<f32> {
     return vec4(x, y, x * x + y * y, x * y);
 }
 
-// Adds a channel of the pixel at (x, y), zero beyond the image.
-fn add_pixel(x: i32, y: i32, channel: u32, sum: ptr<function, Filtered>, taps: vec4<f32>) {
+// Adds the pixel at (x, y), zero beyond the image.
+fn add_pixel(
+    x: i32,
+    y: i32,
+    red: ptr<function, Filtered>,
+    green: ptr<function, Filtered>,
+    blue: ptr<function, Filtered>,
+    taps: vec4<f32>,
+) {
     let inside = x >= 0 && y >= 0 && x < i32(setup.width) && y < i32(setup.height);
     let index = select(0u, u32(y) * setup.width + u32(x), inside);
     let packed = select(0u, target_color[index], inside);
-    let rendered = select(0.0, color_depth[index][channel], packed != 0u);
-    add(sum, quantities(rendered, wanted_pixel(packed)[channel]), taps);
+    let rendered = select(vec3(0.0), color_depth[index].xyz, is_recorded(packed));
+    let wanted = wanted_pixel(packed);
+    add(red, quantities(rendered.x, wanted.x), taps);
+    add(green, quantities(rendered.y, wanted.y), taps);
+    add(blue, quantities(rendered.z, wanted.z), taps);
 }
 
-// Four windows of one row of pixels, from window `column` on.
-fn filter_row(first: vec2<u32>, channel: u32, row: u32, column: u32) {
-    let x = i32(first.x + setup.phase_x + 2u * column) - i32(RADIUS);
-    let y = i32(first.y + setup.phase_y + row) - i32(RADIUS);
-    var sum: Filtered;
-    add_pixel(x + 0, y, channel, &sum, T0);
-    add_pixel(x + 1, y, channel, &sum, T1);
-    add_pixel(x + 2, y, channel, &sum, T2);
-    add_pixel(x + 3, y, channel, &sum, T3);
-    add_pixel(x + 4, y, channel, &sum, T4);
-    add_pixel(x + 5, y, channel, &sum, T5);
-    add_pixel(x + 6, y, channel, &sum, T6);
-    add_pixel(x + 7, y, channel, &sum, T7);
-    add_pixel(x + 8, y, channel, &sum, T8);
-    add_pixel(x + 9, y, channel, &sum, T9);
-    add_pixel(x + 10, y, channel, &sum, T10);
-    add_pixel(x + 11, y, channel, &sum, T11);
-    add_pixel(x + 12, y, channel, &sum, T12);
-    add_pixel(x + 13, y, channel, &sum, T13);
-    add_pixel(x + 14, y, channel, &sum, T14);
-    add_pixel(x + 15, y, channel, &sum, T15);
-    add_pixel(x + 16, y, channel, &sum, T16);
-    let to = row * 8u + column;
-    for (var k = 0u; k < 4u; k++) {
-        rows[to + k] = sum.at[k];
+// Four windows of one column of pixels, from the row of windows `row` on. Side by side, invocations read side by side.
+fn filter_column(
+    first: vec2<u32>,
+    column: u32,
+    row: u32,
+    red: ptr<function, Filtered>,
+    green: ptr<function, Filtered>,
+    blue: ptr<function, Filtered>,
+) {
+    let x = i32(first.x + setup.phase_x + column) - i32(RADIUS);
+    let y = i32(first.y + setup.phase_y + 2u * row) - i32(RADIUS);
+    add_pixel(x, y + 0, red, green, blue, T0);
+    add_pixel(x, y + 1, red, green, blue, T1);
+    add_pixel(x, y + 2, red, green, blue, T2);
+    add_pixel(x, y + 3, red, green, blue, T3);
+    add_pixel(x, y + 4, red, green, blue, T4);
+    add_pixel(x, y + 5, red, green, blue, T5);
+    add_pixel(x, y + 6, red, green, blue, T6);
+    add_pixel(x, y + 7, red, green, blue, T7);
+    add_pixel(x, y + 8, red, green, blue, T8);
+    add_pixel(x, y + 9, red, green, blue, T9);
+    add_pixel(x, y + 10, red, green, blue, T10);
+    add_pixel(x, y + 11, red, green, blue, T11);
+    add_pixel(x, y + 12, red, green, blue, T12);
+    add_pixel(x, y + 13, red, green, blue, T13);
+    add_pixel(x, y + 14, red, green, blue, T14);
+    add_pixel(x, y + 15, red, green, blue, T15);
+    add_pixel(x, y + 16, red, green, blue, T16);
+}
+
+// The windows of one channel, filtered along rows as well.
+fn filter_rows(local: u32, at: u32, sum: Filtered) -> Ssim {
+    workgroupBarrier();
+    if local < 50u {
+        let to = local % 25u % 2u * 13u + local % 25u / 2u + local / 25u * 104u;
+        columns[to] = sum.a;
+        columns[to + 26u] = sum.b;
+        columns[to + 52u] = sum.c;
+        columns[to + 78u] = sum.d;
     }
+    workgroupBarrier();
+    return ssim_of(filter_row(at));
 }
 
-// A window, from the first of its rows on.
-fn filter_column(at: u32) -> vec4<f32> {
-    return W0 * (rows[at] + rows[at + 80u])
-        + W1 * (rows[at + 8u] + rows[at + 72u])
-        + W2 * (rows[at + 16u] + rows[at + 64u])
-        + W3 * (rows[at + 24u] + rows[at + 56u])
-        + W4 * (rows[at + 32u] + rows[at + 48u])
-        + W5 * rows[at + 40u];
+// A window, of which `at` is the first column.
+fn filter_row(at: u32) -> vec4<f32> {
+    return W0 * (columns[at] + columns[at + 5u])
+        + W1 * (columns[at + 13u] + columns[at + 17u])
+        + W2 * (columns[at + 1u] + columns[at + 4u])
+        + W3 * (columns[at + 14u] + columns[at + 16u])
+        + W4 * (columns[at + 2u] + columns[at + 3u])
+        + W5 * columns[at + 15u];
 }
 
 fn ssim_of(filtered: vec4<f32>) -> Ssim {

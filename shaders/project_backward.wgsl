@@ -37,7 +37,9 @@ fn backward(i: u32) {
         slot += select(1u, SLOT_CHUNK, is_sum);
     }
     let untouched = all(color_depth == vec4(0.0)) && all(first == vec4(0.0)) && all(second == vec4(0.0));
-    if untouched {
+    // What reaches into hidden pixels is not seen whole: it would grow over them for the sake of the others.
+    let is_hidden = abs(color_depth.w) > MOST_GRADIENT;
+    if untouched || is_hidden {
         return;
     }
     let mean_opacity = parameters[i];

@@ -1,10 +1,6 @@
 // Gradient of the blended image with respect to each (Gaussian, tile) intersection, written to the intersection's own slot: no atomics, and the sum
 // over a Gaussian's slots runs in a fixed order.
-//
-// This form keeps blocks of pixels in each invocation while the Gaussians pass, and sums over the tile's invocations. It suits narrow SIMD units
-// (the software adapter); `shared/tile_stream` suits wide ones.
 
-const CHUNK: u32 = 8u;
 // [GROUP_TILES, CHUNK, 3, TILE_THREADS] what each invocation adds to each intersection of the chunk.
 var<workgroup> partial: array<vec4<f32>, CHUNK * 3u * THREADS>;
 
@@ -22,15 +18,14 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
     let blended = atomicLoad(&tile_last[place.member]);
     let partials = place.member * CHUNK * 3u * TILE_THREADS;
 
-    for (var start = 0u; start < end; start += BATCH) {
+    for (var start = 0u; start < end; start += TILE_BATCH) {
         workgroupBarrier();
         load_batch(place, start, blended);
         workgroupBarrier();
-        for (var chunk = start; chunk < min(end, start + BATCH); chunk += CHUNK) {
+        for (var chunk = start; chunk < min(end, start + TILE_BATCH); chunk += CHUNK) {
             let chunk_end = min(blended, chunk + CHUNK);
             for (var k = chunk; k < chunk_end; k++) {
-                let at = place.member * BATCH + k - start;
-                let gaussian = listed(at, k);
+                let gaussian = kept_listed(place.member * TILE_BATCH + k - start, k);
                 var sum = IntersectionGradient(vec4(0.0), vec4(0.0), vec4(0.0));
                 for (var s = 0u; s < STRIPS; s++) {
                     var strip = pixels[s];
@@ -38,7 +33,7 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
                     pixels[s] = strip;
                 }
                 let to = partials + (k - chunk) * 3u * TILE_THREADS + place.thread;
-                partial[to] = before_clamp(gaussian.color, sum.color_depth);
+                partial[to] = select(vec4(0.0), sum.color_depth, vec4(gaussian.color.xyz > vec3(0.0), true));
                 partial[to + TILE_THREADS] = sum.first;
                 partial[to + 2u * TILE_THREADS] = sum.second;
             }
@@ -54,15 +49,10 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
             workgroupBarrier();
         }
     }
-    clear_unblended(place, blended);
+    clear_unblended(place, blended, 3u);
 }
 
-// Intersections behind every pixel's last contributor were not blended.
-fn clear_unblended(place: Place, blended: u32) {
-    for (var i = place.range.x + blended + place.thread; i < place.range.y; i += TILE_THREADS) {
-        let slot = sorted_slots[i];
-        intersection_gradients[slot * 3u] = vec4(0.0);
-        intersection_gradients[slot * 3u + 1u] = vec4(0.0);
-        intersection_gradients[slot * 3u + 2u] = vec4(0.0);
-    }
+// What is blended into a hidden pixel has a gradient beyond any other, by which `project_backward` knows it.
+fn hidden_gradient(pixel: u32) -> f32 {
+    return image_gradients[view.width * view.height + pixel].z;
 }

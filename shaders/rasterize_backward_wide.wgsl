@@ -1,27 +1,52 @@
-// The same gradients as `rasterize_backward_narrow`: the sum of `shared/tile_stream`.
+// The same gradients as `rasterize_backward_narrow`: the sums of `shared/tile_sums`.
 
-var<private> sum: IntersectionGradient;
+alias Sum = IntersectionGradient;
+// Ten, and of a planar surface the two by its slopes.
+const VALUES: u32 = 4u + 2u * PROJECTED;
 
-fn load_strip(place: Place, local: u32) {}
-
-fn begin_sum() {
-    sum = IntersectionGradient(vec4(0.0), vec4(0.0), vec4(0.0));
+fn no_sum() -> Sum {
+    return IntersectionGradient(vec4(0.0), vec4(0.0), vec4(0.0));
 }
 
-fn add_strip(gaussian: Listed, x: vec4<f32>, y: f32, strip: u32, pixels: ptr<function, PixelState>) {
-    var grown = sum;
-    add_gradient(gaussian, x, y, pixels, &grown);
-    sum = grown;
+fn begin(corner: vec2<u32>, lane: u32) {}
+
+fn add_pixels(gaussian: Listed, x: f32, y: f32, subtile: u32, pixels: ptr<function, PixelState>, sum: ptr<function, Sum>) {
+    add_gradient(gaussian, x, y, pixels, sum);
 }
 
-fn store_sum(slot: u32, color: vec4<f32>) {
-    intersection_gradients[slot * 3u] = before_clamp(color, sum.color_depth);
-    intersection_gradients[slot * 3u + 1u] = sum.first;
-    intersection_gradients[slot * 3u + 2u] = sum.second;
+fn leave_sum(sum: Sum, to: u32) {
+    partial[to] = sum.color_depth.x;
+    partial[to + ROW] = sum.color_depth.y;
+    partial[to + 2u * ROW] = sum.color_depth.z;
+    partial[to + 3u * ROW] = sum.color_depth.w;
+    partial[to + 4u * ROW] = sum.first.x;
+    partial[to + 5u * ROW] = sum.first.y;
+    partial[to + 6u * ROW] = sum.first.z;
+    partial[to + 7u * ROW] = sum.second.x;
+    partial[to + 8u * ROW] = sum.second.y;
+    partial[to + 9u * ROW] = sum.second.z;
+    //# planar
+    partial[to + 10u * ROW] = sum.first.w;
+    partial[to + 11u * ROW] = sum.second.w;
+    //# end
 }
 
-fn clear_sum(slot: u32) {
-    intersection_gradients[slot * 3u] = vec4(0.0);
-    intersection_gradients[slot * 3u + 1u] = vec4(0.0);
-    intersection_gradients[slot * 3u + 2u] = vec4(0.0);
+fn joined(a: f32, b: f32, value: u32) -> f32 {
+    return a + b;
+}
+
+// The gradient by a colour before its clamp at black.
+fn whole(sum: f32, k: u32, value: u32) -> f32 {
+    return select(sum, 0.0, value < 3u && !(batch_color[k][value % 4u] > 0.0));
+}
+
+// Behind the seventh value is that by the slope along x.
+fn place_in_slot(value: u32) -> u32 {
+    let moved = select(value, value + 1u, value > 6u);
+    return select(moved, 4u * value - 33u, value > 9u);
+}
+
+// What is blended into a hidden pixel has a gradient beyond any other, by which `project_backward` knows it.
+fn hidden_gradient(pixel: u32) -> f32 {
+    return image_gradients[view.width * view.height + pixel].z;
 }

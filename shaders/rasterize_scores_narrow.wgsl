@@ -1,6 +1,5 @@
 // The scores of `shared/tile_scores`, summed as `rasterize_backward_narrow` sums its gradients.
 
-const CHUNK: u32 = 8u;
 // [GROUP_TILES, CHUNK, 2, TILE_THREADS] what each invocation adds to each intersection of the chunk.
 var<workgroup> partial: array<vec4<f32>, CHUNK * 2u * THREADS>;
 
@@ -21,15 +20,14 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
     let blended = atomicLoad(&tile_last[place.member]);
     let partials = place.member * CHUNK * 2u * TILE_THREADS;
 
-    for (var start = 0u; start < end; start += BATCH) {
+    for (var start = 0u; start < end; start += TILE_BATCH) {
         workgroupBarrier();
         load_batch(place, start, blended);
         workgroupBarrier();
-        for (var chunk = start; chunk < min(end, start + BATCH); chunk += CHUNK) {
+        for (var chunk = start; chunk < min(end, start + TILE_BATCH); chunk += CHUNK) {
             let chunk_end = min(blended, chunk + CHUNK);
             for (var k = chunk; k < chunk_end; k++) {
-                let at = place.member * BATCH + k - start;
-                let gaussian = listed(at, k);
+                let gaussian = kept_listed(place.member * TILE_BATCH + k - start, k);
                 var sum = PairScore(vec4(0.0), vec4(0.0));
                 for (var s = 0u; s < STRIPS; s++) {
                     var strip = pixels[s];
@@ -58,14 +56,20 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
             workgroupBarrier();
         }
     }
-    clear_unblended(place, blended);
+    clear_unblended(place, blended, 2u);
 }
 
-// Intersections behind every pixel's last contributor were not blended.
-fn clear_unblended(place: Place, blended: u32) {
-    for (var i = place.range.x + blended + place.thread; i < place.range.y; i += TILE_THREADS) {
-        let slot = sorted_slots[i];
-        intersection_gradients[slot * 3u] = vec4(0.0);
-        intersection_gradients[slot * 3u + 1u] = vec4(0.0);
+// 1 where the error of a strip's pixel exceeds the threshold.
+fn error_pixels(place: Place, strip: u32, threshold: f32) -> vec4<f32> {
+    var is_error = vec4(0.0);
+    for (var p = 0u; p < 4u; p++) {
+        if place.block.columns[p] && strip < place.block.rows {
+            is_error[p] = error_pixel(place.block.first + strip * view.width + p, threshold);
+        }
     }
+    return is_error;
+}
+
+fn hidden_gradient(pixel: u32) -> f32 {
+    return 0.0;
 }

@@ -1,32 +1,53 @@
-// The scores of `shared/tile_scores`: the sum of `shared/tile_stream`.
+// The scores of `shared/tile_scores`: the sums of `shared/tile_sums`.
 
-// Of each strip, a bit for each error pixel.
-var<workgroup> strip_errors: array<u32, TILE_THREADS>;
+alias Sum = PairScore;
+const VALUES: u32 = 7u;
+const LARGEST: u32 = 2u;
 
-var<private> sum: PairScore;
+// A bit for each sub-tile whose pixel is an error pixel.
+var<private> errors: u32;
 
-fn load_strip(place: Place, local: u32) {
-    let is_error = error_pixels(place, 0u, error_threshold());
-    strip_errors[local] = u32(dot(is_error, vec4(1.0, 2.0, 4.0, 8.0)));
+fn no_sum() -> Sum {
+    return PairScore(vec4(0.0), vec4(0.0));
 }
 
-fn begin_sum() {
-    sum = PairScore(vec4(0.0), vec4(0.0));
+fn begin(corner: vec2<u32>, lane: u32) {
+    let threshold = error_threshold();
+    errors = 0u;
+    for (var s = 0u; s < SUBTILES; s++) {
+        let pixel = pixel_of(corner, s, lane);
+        if is_on_image(pixel) {
+            errors |= u32(error_pixel(pixel.y * view.width + pixel.x, threshold)) << s;
+        }
+    }
 }
 
-fn add_strip(gaussian: Listed, x: vec4<f32>, y: f32, strip: u32, pixels: ptr<function, PixelState>) {
-    let is_error = select(vec4(0.0), vec4(1.0), (vec4(strip_errors[strip]) & vec4(1u, 2u, 4u, 8u)) != vec4(0u));
-    var grown = sum;
-    add_score(gaussian, x, y, is_error, pixels, &grown);
-    sum = grown;
+fn add_pixels(gaussian: Listed, x: f32, y: f32, subtile: u32, pixels: ptr<function, PixelState>, sum: ptr<function, Sum>) {
+    add_score(gaussian, x, y, f32((errors >> subtile) & 1u), pixels, sum);
 }
 
-fn store_sum(slot: u32, color: vec4<f32>) {
-    intersection_gradients[slot * 3u] = sum.seen;
-    intersection_gradients[slot * 3u + 1u] = sum.gradient;
+fn leave_sum(sum: Sum, to: u32) {
+    partial[to] = sum.seen.x;
+    partial[to + ROW] = sum.seen.y;
+    partial[to + LARGEST * ROW] = sum.seen.z;
+    partial[to + 3u * ROW] = sum.gradient.x;
+    partial[to + 4u * ROW] = sum.gradient.y;
+    partial[to + 5u * ROW] = sum.gradient.z;
+    partial[to + 6u * ROW] = sum.gradient.w;
 }
 
-fn clear_sum(slot: u32) {
-    intersection_gradients[slot * 3u] = vec4(0.0);
-    intersection_gradients[slot * 3u + 1u] = vec4(0.0);
+fn joined(a: f32, b: f32, value: u32) -> f32 {
+    return select(a + b, max(a, b), value == LARGEST);
+}
+
+fn whole(sum: f32, k: u32, value: u32) -> f32 {
+    return sum;
+}
+
+fn place_in_slot(value: u32) -> u32 {
+    return select(value, value + 1u, value > LARGEST);
+}
+
+fn hidden_gradient(pixel: u32) -> f32 {
+    return 0.0;
 }

@@ -16,6 +16,9 @@
 // [intersections] depth keys of long lists.
 @group(0) @binding(5) var<storage, read_write> keys: array<u32>;
 
+// [intersections] Gaussian of each, in the order of the lists.
+@group(0) @binding(6) var<storage, read_write> sorted_gaussians: array<u32>;
+
 const THREADS: u32 = 64u;
 const CHUNK: u32 = 512u;
 
@@ -94,6 +97,7 @@ fn merge_halves(length: u32, largest: u32, local: u32) {
 fn store_chunk(to: u32, length: u32, is_long: bool, local: u32) {
     for (var k = local; k < length; k += THREADS) {
         slots[to + k] = items[k].y;
+        sorted_gaussians[to + k] = slot_gaussians[items[k].y];
         if is_long {
             keys[to + k] = items[k].x;
         }

@@ -46,22 +46,25 @@ const O6 = vec4(0.0, 0.0, W0, W1);
 
 // Filtered quantities of four outputs side by side.
 struct Filtered {
-    at: array<vec4<f32>, 4>,
+    a: vec4<f32>,
+    b: vec4<f32>,
+    c: vec4<f32>,
+    d: vec4<f32>,
 }
 
 fn add(sum: ptr<function, Filtered>, value: vec4<f32>, taps: vec4<f32>) {
     // The taps are constants: a zero one costs nothing.
     if taps.x != 0.0 {
-        (*sum).at[0] += taps.x * value;
+        (*sum).a += taps.x * value;
     }
     if taps.y != 0.0 {
-        (*sum).at[1] += taps.y * value;
+        (*sum).b += taps.y * value;
     }
     if taps.z != 0.0 {
-        (*sum).at[2] += taps.z * value;
+        (*sum).c += taps.z * value;
     }
     if taps.w != 0.0 {
-        (*sum).at[3] += taps.w * value;
+        (*sum).d += taps.w * value;
     }
 }
 

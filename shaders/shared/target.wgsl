@@ -23,10 +23,15 @@ struct LossSetup {
     blue_gain: f32,
 }
 
-// A pixel of the recorded image in the map's colours, 0 to 1; lane w is 0 where nothing was recorded.
+// Alpha is 1 where something was recorded, else 0.
+fn is_recorded(packed: u32) -> bool {
+    return packed > 0xffffffu;
+}
+
+// A pixel of the recorded image in the map's colours, 0 to 1; all lanes are 0 where nothing was recorded.
 fn wanted_pixel(packed: u32) -> vec4<f32> {
     let gains = vec4(setup.red_gain, setup.green_gain, setup.blue_gain, 1.0);
-    return min(unpack4x8unorm(packed) * gains, vec4(1.0));
+    return min(unpack4x8unorm(select(0u, packed, is_recorded(packed))) * gains, vec4(1.0));
 }
 
 // What a residual of depth counts, as a share of `depth_weight`.

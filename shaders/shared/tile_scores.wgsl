@@ -29,20 +29,13 @@ fn error_threshold() -> f32 {
     return max(setup.noise, setup.error_ratio * total.x / (3.0 * setup.pixels));
 }
 
-// 1 where the error of a strip's pixel exceeds the threshold.
-fn error_pixels(place: Place, strip: u32, threshold: f32) -> vec4<f32> {
-    let errors = view.width * view.height + place.block.first + strip * view.width;
-    var is_error = vec4(0.0);
-    for (var p = 0u; p < 4u; p++) {
-        if place.block.columns[p] && strip < place.block.rows && image_gradients[errors + p].y > threshold {
-            is_error[p] = 1.0;
-        }
-    }
-    return is_error;
+// 1 where the error of a pixel exceeds the threshold.
+fn error_pixel(pixel: u32, threshold: f32) -> f32 {
+    return select(0.0, 1.0, image_gradients[view.width * view.height + pixel].y > threshold);
 }
 
-// Takes a strip past one Gaussian as `add_gradient` does, and adds to its score.
-fn add_score(gaussian: Listed, x: vec4<f32>, y: f32, is_error: vec4<f32>, pixels: ptr<function, PixelState>, sum: ptr<function, PairScore>) {
+// Takes the pixels at columns `x` of row `y` past one Gaussian as `add_gradient` does, and adds to its score.
+fn add_score(gaussian: Listed, x: Pixels, y: f32, is_error: Pixels, pixels: ptr<function, PixelState>, sum: ptr<function, PairScore>) {
     let shape = gaussian.shape;
     let dy = y - gaussian.mean.y;
     let dx = x - gaussian.mean.x;
@@ -52,10 +45,8 @@ fn add_score(gaussian: Listed, x: vec4<f32>, y: f32, is_error: vec4<f32>, pixels
     let weight = passed.weight;
     let by_x = 2.0 * passed.q * shape.x * u;
     let by_y = 2.0 * passed.q * (shape.y * u + shape.z * v);
-    let ones = vec4(1.0);
-    let blended = select(vec4(0.0), is_error, passed.hit);
-    let largest = max(max(weight.x, weight.y), max(weight.z, weight.w));
+    let errors = sum_of(select(Pixels(0.0), is_error, passed.hit));
     let before = (*sum).seen;
-    (*sum).seen = vec4(before.x + dot(blended, ones), before.y + dot(weight, ones), max(before.z, largest), 0.0);
-    (*sum).gradient += vec4(dot(by_x, ones), dot(by_y, ones), dot(abs(by_x), ones), dot(abs(by_y), ones));
+    (*sum).seen = vec4(before.x + errors, before.y + sum_of(weight), max(before.z, largest_of(weight)), 0.0);
+    (*sum).gradient += vec4(sum_of(by_x), sum_of(by_y), sum_of(abs(by_x)), sum_of(abs(by_y)));
 }

@@ -55,7 +55,7 @@ pub struct StepReport {
     pub floor_ms: f64,
     /// The host's time to encode and submit a step, while the GPU works on others.
     pub encode_ms: f64,
-    /// Forward evaluations per second of `rasterize_forward`.
+    /// Forward evaluations per second of the forward blending.
     pub evaluations_per_s: Option<f64>,
     /// The stages, by name.
     pub stages: Vec<StageReport>,
@@ -171,7 +171,7 @@ pub fn bench_step(gpu: &Arc<Gpu>, scene: BenchScene, bench: &StepBench, rates: &
             floor_ms: floors.get(stage).copied().unwrap_or(0.0),
         })
         .collect();
-    let forward = stages.iter().find(|s| s.stage == "rasterize_forward");
+    let forward = stages.iter().find(|s| s.stage == bench.form.forward_stage());
     Ok(StepReport {
         bench: *bench,
         work,
@@ -206,7 +206,7 @@ fn floors(work: &Work, bench: &StepBench, rates: &Rates) -> BTreeMap<&'static st
     let stages = [
         ("project_forward", floor(n * (16.0 * (2.0 + coefficients) + 20.0) + visible * 64.0, n * 150.0)),
         (bench.form.lists_stage(), floor(visible * 2.0 * 40.0 + intersections * 12.0, 2.0 * intersections * 40.0)),
-        ("rasterize_forward", floor(intersections * 56.0 + pixels * 24.0, evaluations * 11.0 + blended * 24.0)),
+        (bench.form.forward_stage(), floor(intersections * 56.0 + pixels * 24.0, evaluations * 11.0 + blended * 24.0)),
         ("loss_forward", floor(pixels * (20.0 + 12.0 + 12.0), taps * 5.0)),
         ("loss_backward", floor(pixels * (20.0 + 12.0 + 12.0 + 32.0), taps * 3.0)),
         (bench.form.backward_stage(), floor(intersections * 104.0 + pixels * 56.0, back * 11.0 + blended * 70.0)),

@@ -14,14 +14,22 @@ pub use twins::*;
 pub const TILE_WIDTH: u32 = 16;
 /// Height of a tile, pixels.
 pub const TILE_HEIGHT: u32 = 8;
+/// The wide form's blending passes divide a tile into sub-tiles of 8×4 pixels.
+pub const SUBTILE_WIDTH: u32 = 8;
+/// Height of a sub-tile, pixels.
+pub const SUBTILE_HEIGHT: u32 = 4;
+/// Strips of 4×1 pixels that an invocation of the narrow form's blending passes takes.
+pub const STRIPS: u32 = TILE_HEIGHT;
+/// Tiles that a workgroup of these passes takes.
+pub const GROUP_TILES: u32 = 2;
 /// Parts of the list of tiles from which successive workgroups of the blending passes take in turn.
 pub const LIST_PARTS: u32 = 16;
 /// Keys that one workgroup sorts.
 pub const SORT_BLOCK: u32 = 1024;
 /// Blocks whose digit counts one workgroup scans.
 pub const SORT_CHUNK: u32 = 64;
-/// Gaussians of a tile's list that one workgroup takes in the wide form's backward pass.
-pub const BUCKET: u32 = 128;
+/// Gaussians of a tile's list that one workgroup takes in the wide form's backward pass: a multiple of what the blending passes load at a time.
+pub const BUCKET: u32 = 96;
 /// Counters in the counter buffer.
 pub const VISIBLE_COUNTER: u32 = 0;
 /// Counter of tile intersections.
@@ -57,12 +65,19 @@ pub const DIVIDED_BY_CLONING: u32 = 1 << 31;
 /// Planes of vec4 that precede the higher harmonics: (position, raw opacity), (log scale, sampling interval), rotation (w, x, y, z), (constant colour, -).
 pub const GEOMETRY_PLANES: usize = 3;
 
+/// Pixel of a keyframe that shows what is away: of no colour, and no alpha.
+pub const HIDDEN: u32 = 1;
+/// What stands for the gradient by a hidden pixel's depth.
+pub const HIDDEN_GRADIENT: f64 = 1e12;
+/// The gradient by a depth is below this, and that of a Gaussian that is blended into a hidden pixel above.
+pub const MOST_GRADIENT: f64 = 1e6;
+
 /// How a tile's pixels are spread over invocations. Both forms give the same result up to rounding; each is the faster one on its kind
 /// of adapter.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum BlendForm {
-    /// A strip of 4×1 pixels each, 32 invocations a tile; the backward pass keeps a Gaussian per invocation. For GPUs.
+    /// A pixel each, and sub-tiles of 8×4 pixels that a Gaussian does not reach are passed over; the backward pass takes a tile's list in buckets. For GPUs.
     #[default]
     Wide,
     /// A block of 4×8 pixels each, four invocations a tile, two tiles a workgroup: every load from memory serves 32 pixels, and a Gaussian's gradient is summed
@@ -81,6 +96,14 @@ impl BlendForm {
         if gpu.is_software() && !is_swiftshader { Self::Narrow } else { Self::Wide }
     }
 
+    /// Name of the stage that blends forward in this form.
+    pub fn forward_stage(self) -> &'static str {
+        match self {
+            Self::Wide => "rasterize_forward_wide",
+            Self::Narrow => "rasterize_forward_narrow",
+        }
+    }
+
     /// Name of the stage that blends backward in this form.
     pub fn backward_stage(self) -> &'static str {
         match self {
@@ -97,14 +120,6 @@ impl BlendForm {
         }
     }
 
-    /// Strips of 4×1 pixels per invocation.
-    fn strips(self) -> u32 {
-        match self {
-            Self::Wide => 1,
-            Self::Narrow => 8,
-        }
-    }
-
     /// Intersections of a Gaussian that are summed before its own turn comes. Where lanes are few, one Gaussian's many intersections keep
     /// few others waiting, and a pass of its own costs more.
     pub(crate) fn slot_chunk(self) -> u32 {
@@ -115,19 +130,11 @@ impl BlendForm {
         }
     }
 
-    /// Tiles that a workgroup of a blending pass takes.
-    fn group_tiles(self) -> u32 {
-        match self {
-            Self::Wide => 1,
-            Self::Narrow => 2,
-        }
-    }
-
     /// Workgroups of a blending pass over so many tiles.
     pub fn workgroups(self, tiles: u32) -> [u32; 3] {
         match self {
             Self::Wide => workgroups(tiles),
-            Self::Narrow => workgroups(tiles.div_ceil(self.group_tiles()).next_multiple_of(LIST_PARTS)),
+            Self::Narrow => workgroups(tiles.div_ceil(GROUP_TILES).next_multiple_of(LIST_PARTS)),
         }
     }
 }
@@ -210,21 +217,26 @@ pub fn wgsl_constants(blending: Blending) -> String {
         ("LEAST_UNDILUTED", LEAST_UNDILUTED),
         ("MIN_DETERMINANT", MIN_DETERMINANT),
         ("BRIGHTNESS_STEP", f64::from(BRIGHTNESS_STEP)),
+        ("HIDDEN_GRADIENT", HIDDEN_GRADIENT),
+        ("MOST_GRADIENT", MOST_GRADIENT),
         ("MIN_QUATERNION_NORM_SQUARED", MIN_QUATERNION_NORM_SQUARED),
     ];
     let integers = [
         ("TILE_WIDTH", TILE_WIDTH),
         ("TILE_HEIGHT", TILE_HEIGHT),
-        ("STRIPS", form.strips()),
+        ("SUBTILE_WIDTH", SUBTILE_WIDTH),
+        ("SUBTILE_HEIGHT", SUBTILE_HEIGHT),
+        ("STRIPS", STRIPS),
         ("PROJECTED", blending.projected()),
         ("IMAGE_PLANES", blending.image_planes()),
         ("CHECKPOINT", blending.checkpoint()),
-        ("GROUP_TILES", form.group_tiles()),
+        ("GROUP_TILES", GROUP_TILES),
         ("LIST_PARTS", LIST_PARTS),
         ("SORT_BLOCK", SORT_BLOCK),
         ("DEPTH_KEY_STEP", DEPTH_KEY_STEP),
         ("SORT_CHUNK", SORT_CHUNK),
         ("BUCKET", BUCKET),
+        ("HIDDEN", HIDDEN),
         ("SLOT_CHUNK", form.slot_chunk()),
         ("VISIBLE_COUNTER", VISIBLE_COUNTER),
         ("INTERSECTION_COUNTER", INTERSECTION_COUNTER),

@@ -12,7 +12,7 @@ mod sort;
 mod workspace;
 
 pub use cloud::{CloudPart, CloudState, GaussianHistory, GpuCloud, RunMotion};
-pub use layout::{BlendForm, Blending};
+pub use layout::{BlendForm, Blending, HIDDEN};
 pub use plan::{Division, Plan};
 pub use rasterizer::{PreparedView, Rasterizer, ViewCounts};
 pub use rendered::Rendered;

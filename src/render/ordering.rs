@@ -62,6 +62,14 @@ impl Ordering {
         }
     }
 
+    /// The Gaussians that the blending passes read: of each sorted intersection, or of each slot.
+    pub fn gaussians<'a>(&self, ws: &'a Workspace) -> &'a GpuBuffer {
+        match self {
+            Self::Lists(_) => &ws.slots[1],
+            Self::Radix(_) => &ws.slot_gaussians,
+        }
+    }
+
     /// Encodes what precedes the lists.
     pub fn encode_before_lists(&self, gpu: &Gpu, pass: &mut wgpu::ComputePass<'_>, ws: &Workspace) {
         if let Self::Radix(radix) = self {
@@ -87,6 +95,7 @@ impl Ordering {
                     (3, &ws.projected),
                     (4, &ws.slots[0]),
                     (5, &ws.tile_keys[0]),
+                    (6, &ws.slots[1]),
                 ];
                 sort_tiles.dispatch(gpu, pass, &bindings, workgroups(tiles));
             }

@@ -98,7 +98,10 @@ impl Rasterizer {
                 BlendForm::Wide => &shaders::TILE_LISTS_WIDE,
                 BlendForm::Narrow => &shaders::TILE_LISTS_NARROW,
             }),
-            rasterize_forward: kernel(&shaders::RASTERIZE_FORWARD),
+            rasterize_forward: kernel(match form {
+                BlendForm::Wide => &shaders::RASTERIZE_FORWARD_WIDE,
+                BlendForm::Narrow => &shaders::RASTERIZE_FORWARD_NARROW,
+            }),
             scan_blocks: kernel(&shaders::SCAN_BLOCKS),
             ordering: Ordering::new(&gpu, blending)?,
         };
@@ -191,7 +194,7 @@ impl Rasterizer {
             (0, self.view(prepared)),
             (1, &ws.ranges),
             (2, &ws.slots[prepared.sorted]),
-            (3, &ws.slot_gaussians),
+            (3, self.kernels.ordering.gaussians(ws)),
             (4, &ws.projected),
             (5, &ws.color_depth),
             (6, &ws.state),
@@ -237,7 +240,9 @@ impl Rasterizer {
         k.compact_visible.dispatch(gpu, pass, &compact, per_gaussian);
         k.ordering.encode_before_lists(gpu, pass, ws);
         self.encode_tiles(pass, prepared);
-        k.rasterize_forward.dispatch(gpu, pass, &self.lists(prepared), self.form().workgroups(view.tiles()));
+        // The wide form needs no slots yet.
+        let lists = self.lists(prepared).into_iter().filter(|(binding, _)| *binding != 2 || self.form() == BlendForm::Narrow);
+        k.rasterize_forward.dispatch(gpu, pass, &lists.collect::<Vec<_>>(), self.form().workgroups(view.tiles()));
     }
 
     /// Tile lists: count, offsets, emit; then each sorted by depth, or all by tile.

@@ -8,8 +8,8 @@ use image::{Rgb, RgbImage};
 use keysplat::geometry::{Pinhole, Se3};
 use keysplat::gpu::Gpu;
 use keysplat::mapping::{Keyframe, Mapper, MappingConfig, MappingError, PoseUpdate};
-use keysplat::optimise::{AdamConfig, LossConfig, TargetImage, Trainer, TrainingView};
-use keysplat::render::{GpuCloud, MapRenderer, Plan};
+use keysplat::optimise::{AdamConfig, LossConfig, Pixels, TargetImage, Trainer, TrainingView};
+use keysplat::render::{BlendForm, GpuCloud, HIDDEN, MapRenderer, Plan};
 use keysplat::splat::model::Surface;
 use keysplat::splat::{GaussianCloud, ShDegree, ViewCamera};
 use nalgebra::Vector3;
@@ -115,6 +115,37 @@ fn no_step_moves_what_is_fixed_until_it_is_free_again() {
     assert_eq!(moved(&mut map, &moved_up), 0);
     map.fix(&gpu, &[]).unwrap();
     assert!(moved(&mut map, &moved_up) > 10);
+}
+
+#[test]
+fn what_is_blended_into_hidden_pixels_learns_nothing() {
+    let Some(gpu) = adapter() else { return };
+    let rng = &mut Rng::with_seed(5);
+    let degree = ShDegree::new(1).unwrap();
+    let scene = crate::common::scene(rng, 90, degree);
+    let camera = crate::common::camera(rng, 48, 32);
+    let recorded: Vec<u32> = (0..48 * 32).map(|_| rng.u32(..) | 0xff00_0000).collect();
+    let mut target = TargetImage::new(&gpu, &RgbImage::new(48, 32), None).unwrap();
+    target.offload();
+    for form in BlendForm::ALL {
+        let mut trainer = Trainer::with_blending(gpu.clone(), form).unwrap();
+        // The Gaussians that a step moves where the left and the right half have these pixels instead of the recorded ones.
+        let mut moved = |left: Option<u32>, right: Option<u32>| -> Vec<usize> {
+            let mut map = GpuCloud::new(&gpu, degree, 90).unwrap();
+            map.append(&gpu, &scene).unwrap();
+            let color = (0..).zip(&recorded).map(|(i, pixel)| if i % 48 < 24 { left } else { right }.unwrap_or(*pixel)).collect();
+            let pixels = Pixels { color, depth_metres: vec![0.0; 48 * 32] };
+            let view = TrainingView { streamed: Some(&pixels), ..TrainingView::new(camera, &target) };
+            let before = map.copy_out(&gpu, &(0..90).collect::<Vec<_>>()).unwrap();
+            trainer.steps(&map, &[view], &LossConfig::default(), &AdamConfig::default()).unwrap();
+            let after = map.copy_out(&gpu, &(0..90).collect::<Vec<_>>()).unwrap();
+            (0..90).filter(|i| before.picked(&[*i]) != after.picked(&[*i])).collect()
+        };
+        let (on_the_left, on_the_right) = (moved(None, Some(0)), moved(Some(0), None));
+        let alone: Vec<usize> = on_the_left.iter().copied().filter(|i| !on_the_right.contains(i)).collect();
+        assert!(alone.len() > 10 && alone.len() + 5 < on_the_left.len(), "{alone:?} of {on_the_left:?}");
+        assert_eq!(moved(None, Some(HIDDEN)), alone, "{form:?}");
+    }
 }
 
 #[test]

@@ -2,12 +2,14 @@
 //! what walls hide counts as unseen.
 
 use glam::Vec3;
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::Ball;
 use crate::geometry::Pinhole;
 use crate::gpu::plain;
 use crate::optimise::Pixels;
+use crate::render::HIDDEN;
 use crate::sequence::RectifiedImage;
 use crate::splat::ViewCamera;
 use crate::splat::model::NEAR_METRES;
@@ -33,11 +35,15 @@ impl Sight {
         let Pinhole { width, height, .. } = image.pinhole;
         let (columns, rows) = (width.div_ceil(BLOCK), height.div_ceil(BLOCK));
         let mut farthest = vec![0.0f32; (columns * rows) as usize];
-        for (y, line) in image.depth.iter().flat_map(|depth| depth.metres.chunks_exact(width as usize)).enumerate() {
-            let row = &mut farthest[y / BLOCK as usize * columns as usize..][..columns as usize];
-            for (block, metres) in row.iter_mut().zip(line.chunks(BLOCK as usize)) {
-                *block = metres.iter().fold(*block, |most, metres| most.max(*metres));
-            }
+        if let Some(depth) = &image.depth {
+            let stripes = depth.metres.par_chunks((width * BLOCK) as usize);
+            farthest.par_chunks_mut(columns as usize).zip(stripes).for_each(|(row, stripe)| {
+                for line in stripe.chunks_exact(width as usize) {
+                    for (block, metres) in row.iter_mut().zip(line.chunks(BLOCK as usize)) {
+                        *block = metres.iter().fold(*block, |most, metres| most.max(*metres));
+                    }
+                }
+            });
         }
         let most = farthest.iter().fold(0.0, |most: f32, metres| most.max(*metres));
         let unknown = if most > 0.0 { most } else { f32::INFINITY };
@@ -160,7 +166,7 @@ impl Hidden {
         self.left as f32 / self.blocks.len().max(1) as f32
     }
 
-    /// Leaves out the pixels of an image so many pixels wide, of half the size if `halved`.
+    /// Marks the pixels of an image so many pixels wide, of half the size if `halved`.
     pub fn leave_out(&self, pixels: &mut Pixels, width: u32, halved: bool) {
         let side = if halved { BLOCK / 2 } else { BLOCK };
         let rows = pixels.color.chunks_mut(width as usize).zip(pixels.depth_metres.chunks_mut(width as usize));
@@ -168,7 +174,7 @@ impl Hidden {
             let line = &self.blocks[(y / side * self.columns) as usize..][..self.columns as usize];
             for (x, (color, metres)) in (0..).zip(colors.iter_mut().zip(depths)) {
                 if line[(x / side) as usize] {
-                    (*color, *metres) = (0, 0.0);
+                    (*color, *metres) = (HIDDEN, 0.0);
                 }
             }
         }
@@ -234,11 +240,11 @@ mod tests {
             let count = (width * width * 3 / 4) as usize;
             let mut pixels = Pixels { color: vec![7; count], depth_metres: vec![1.0; count] };
             hidden.leave_out(&mut pixels, width, halved);
-            let is_left_out = |x: u32, y: u32| pixels.color[(y * width + x) as usize] == 0;
+            let is_left_out = |x: u32, y: u32| pixels.color[(y * width + x) as usize] == HIDDEN;
             assert!(is_left_out(width * 9 / 16, width * 3 / 8) && !is_left_out(width * 7 / 16, width * 3 / 8));
             assert!(!is_left_out(width * 9 / 16, 0) && !is_left_out(width - 1, width * 3 / 8));
-            assert!(pixels.color.iter().zip(&pixels.depth_metres).all(|(color, metres)| (*color == 0) == (*metres == 0.0)));
-            shares.push(pixels.color.iter().filter(|color| **color != 0).count() as f32 / count as f32);
+            assert!(pixels.color.iter().zip(&pixels.depth_metres).all(|(color, metres)| (*color == HIDDEN) == (*metres == 0.0)));
+            shares.push(pixels.color.iter().filter(|color| **color != HIDDEN).count() as f32 / count as f32);
         }
         assert_eq!(shares, [hidden.seen(); 2]);
     }

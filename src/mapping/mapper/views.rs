@@ -10,6 +10,8 @@ use crate::mapping::chunks::{Hidden, Outlook};
 
 /// Share of an image that steps learn from at least.
 const LEAST_SEEN: f32 = 0.5;
+/// Share of the keyframes near by that see a Gaussian from which steps can learn, at least, where the Gaussian is to be moved.
+const LEAST_LEARNABLE: f32 = 0.75;
 /// Keyframes near by that are looked at, so that the work for a keyframe does not grow with the map.
 const NEAR: usize = 256;
 
@@ -55,7 +57,8 @@ impl Mapper {
         self.learnable = near.into_par_iter().filter(is_learnable).collect();
     }
 
-    /// Fixes the Gaussians on the GPU that steps would spoil: neither their keyframe can be learnt from, nor half of those near by that see them.
+    /// Fixes the Gaussians on the GPU that steps would spoil: all but those of the window's keyframes, and those whose own keyframe can be learnt from and
+    /// most of those near by that see them.
     pub(super) fn fix_context(&mut self) -> Result<(), MappingError> {
         if self.chunks.are_here() {
             return self.fix(&[]);
@@ -66,17 +69,20 @@ impl Mapper {
         let views: Vec<(bool, Outlook<'_>)> =
             near.iter().map(|k| (self.is_learnable(*k), self.keyframes[*k].outlook())).collect();
         let is_context = |group: &Group| {
-            let seeing = views.iter().filter(|(_, outlook)| outlook.sees(&group.ball));
-            seeing.fold(0, |balance, (is_learnable, _)| if *is_learnable { balance + 1 } else { balance - 1 }) < 0
+            let seeing: Vec<bool> = views.iter().filter(|(_, outlook)| outlook.sees(&group.ball)).map(|(is, _)| *is).collect();
+            let learnable = seeing.iter().filter(|is_learnable| **is_learnable).count();
+            (learnable as f32) < LEAST_LEARNABLE * seeing.len() as f32
         };
         let groups = self.groups()?;
-        let context: Vec<&Group> = groups.par_iter().filter(|group| is_context(group)).collect();
-        let is_of_learnable = |place: &u32| {
-            let keyframe = self.keyframes.binary_search_by_key(&self.anchors.keyframe(*place), |keyframe| keyframe.id);
-            keyframe.is_ok_and(|k| self.is_learnable(k))
+        let context: Vec<bool> = groups.par_iter().map(is_context).collect();
+        let is_free = |place: u32, is_context: bool| {
+            let own = self.keyframes.binary_search_by_key(&self.anchors.keyframe(place), |keyframe| keyframe.id);
+            own.is_ok_and(|k| self.needing.contains(&k) || (self.is_learnable(k) && !is_context))
         };
+        let places =
+            groups.iter().zip(context).flat_map(|(group, is_context)| group.places.iter().map(move |p| (*p, is_context)));
         let mut fixed: Vec<u32> =
-            context.iter().flat_map(|group| &group.places).copied().filter(|place| !is_of_learnable(place)).collect();
+            places.filter(|(place, is_context)| !is_free(*place, *is_context)).map(|(place, _)| place).collect();
         fixed.sort_unstable();
         tracing::debug!(
             learnable = self.learnable.len(),
