@@ -1,35 +1,36 @@
-// The forward pass of `shared/blend`: a workgroup takes a tile, and an invocation one pixel of each sub-tile.
+// The forward pass of `shared/blend`: a workgroup takes a tile, one half of its invocations the upper sub-tiles, the other the lower ones; an invocation has one
+// pixel of each.
 
+const THREADS: u32 = 2u * SUBTILE_PIXELS;
 // Gaussians in workgroup memory at a time; BUCKET is a multiple.
-const BATCH: u32 = SUBTILE_PIXELS;
+const BATCH: u32 = 48u;
 // The sub-tiles that each Gaussian of the batch reaches.
 var<workgroup> batch_reach: array<u32, BATCH>;
 // A bit for each sub-tile whose pixels take more.
 var<workgroup> open_subtiles: atomic<u32>;
 
-@compute @workgroup_size(SUBTILE_PIXELS)
+@compute @workgroup_size(THREADS)
 fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_index) local: u32) {
     let tile = linear_workgroup(workgroup);
     if tile >= view.tiles_x * view.tiles_y {
         return;
     }
     let corner = corner_of(tile);
-    let at = vec2<f32>(pixel_of(corner, 0u, local));
+    let lane = local % SUBTILE_PIXELS;
+    let left = left_subtile(local);
+    let at = vec2<f32>(pixel_of(corner, left, lane));
     let range = ranges[tile];
     let count = range.y - range.x;
     // Only as constants may the sub-tiles name registers.
-    var blended_0 = nothing_blended(corner, 0u, local);
-    var blended_1 = nothing_blended(corner, 1u, local);
-    var blended_2 = nothing_blended(corner, 2u, local);
-    var blended_3 = nothing_blended(corner, 3u, local);
+    var blended_left = nothing_blended(corner, left, lane);
+    var blended_right = nothing_blended(corner, left + 1u, lane);
     var ahead = batch_ahead(range.x, 0u, count, local);
     for (var start = 0u; start < count; start += BATCH) {
         if local == 0u {
             atomicStore(&open_subtiles, 0u);
         }
         workgroupBarrier();
-        let is_open = vec4(blended_0.open, blended_1.open, blended_2.open, blended_3.open);
-        atomicOr(&open_subtiles, dot(select(vec4(0u), vec4(1u, 2u, 4u, 8u), is_open), vec4(1u)));
+        atomicOr(&open_subtiles, (select(0u, 1u, blended_left.open) | select(0u, 2u, blended_right.open)) << left);
         if local < BATCH && start + local < count {
             keep_listed(local, ahead);
             batch_reach[local] = subtiles_of(corner, ahead);
@@ -41,37 +42,27 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
         ahead = batch_ahead(range.x, start + BATCH, count, local);
         if start > 0u && start % BUCKET == 0u {
             let bucket = (range.x + start) / BUCKET;
-            keep_checkpoint(bucket, local, blended_0);
-            keep_checkpoint(bucket, SUBTILE_PIXELS + local, blended_1);
-            keep_checkpoint(bucket, 2u * SUBTILE_PIXELS + local, blended_2);
-            keep_checkpoint(bucket, 3u * SUBTILE_PIXELS + local, blended_3);
+            keep_checkpoint(bucket, left * SUBTILE_PIXELS + lane, blended_left);
+            keep_checkpoint(bucket, (left + 1u) * SUBTILE_PIXELS + lane, blended_right);
         }
         for (var k = 0u; k < min(BATCH, count - start); k++) {
-            let reached = batch_reach[k] & open;
+            let reached = ((batch_reach[k] & open) >> left) & 3u;
             if reached == 0u {
                 continue;
             }
             let gaussian = kept_listed(k, start + k);
-            let d = at - gaussian.mean.xy;
+            let dy = at.y - gaussian.mean.y;
             if (reached & 1u) != 0u {
-                blend(gaussian, d.x, d.y, &blended_0);
+                blend(gaussian, at.x - gaussian.mean.x, dy, &blended_left);
             }
             if (reached & 2u) != 0u {
-                blend(gaussian, at.x + ACROSS - gaussian.mean.x, d.y, &blended_1);
-            }
-            if (reached & 4u) != 0u {
-                blend(gaussian, d.x, at.y + DOWN - gaussian.mean.y, &blended_2);
-            }
-            if (reached & 8u) != 0u {
-                blend(gaussian, at.x + ACROSS - gaussian.mean.x, at.y + DOWN - gaussian.mean.y, &blended_3);
+                blend(gaussian, at.x + ACROSS - gaussian.mean.x, dy, &blended_right);
             }
         }
         workgroupBarrier();
     }
-    store(pixel_of(corner, 0u, local), blended_0);
-    store(pixel_of(corner, 1u, local), blended_1);
-    store(pixel_of(corner, 2u, local), blended_2);
-    store(pixel_of(corner, 3u, local), blended_3);
+    store(pixel_of(corner, left, lane), blended_left);
+    store(pixel_of(corner, left + 1u, lane), blended_right);
 }
 
 fn nothing_blended(corner: vec2<u32>, subtile: u32, lane: u32) -> Blended {

@@ -41,6 +41,11 @@ fn pixel_of(corner: vec2<u32>, subtile: u32, lane: u32) -> vec2<u32> {
     return corner + vec2(x, y);
 }
 
+// Of the two sub-tiles of which an invocation has a pixel: a first half of a workgroup has the upper ones.
+fn left_subtile(local: u32) -> u32 {
+    return local / SUBTILE_PIXELS * SUBTILES_ACROSS;
+}
+
 fn is_on_image(pixel: vec2<u32>) -> bool {
     return pixel.x < view.width && pixel.y < view.height;
 }

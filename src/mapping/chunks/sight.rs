@@ -9,7 +9,6 @@ use super::Ball;
 use crate::geometry::Pinhole;
 use crate::gpu::plain;
 use crate::optimise::Pixels;
-use crate::render::HIDDEN;
 use crate::sequence::RectifiedImage;
 use crate::splat::ViewCamera;
 use crate::splat::model::NEAR_METRES;
@@ -166,15 +165,15 @@ impl Hidden {
         self.left as f32 / self.blocks.len().max(1) as f32
     }
 
-    /// Marks the pixels of an image so many pixels wide, of half the size if `halved`.
-    pub fn leave_out(&self, pixels: &mut Pixels, width: u32, halved: bool) {
+    /// Leaves out the pixels of an image so many pixels wide, of half the size if `halved`: `mark` stands in their place.
+    pub fn leave_out(&self, pixels: &mut Pixels, width: u32, halved: bool, mark: u32) {
         let side = if halved { BLOCK / 2 } else { BLOCK };
         let rows = pixels.color.chunks_mut(width as usize).zip(pixels.depth_metres.chunks_mut(width as usize));
         for (y, (colors, depths)) in (0..).zip(rows) {
             let line = &self.blocks[(y / side * self.columns) as usize..][..self.columns as usize];
             for (x, (color, metres)) in (0..).zip(colors.iter_mut().zip(depths)) {
                 if line[(x / side) as usize] {
-                    (*color, *metres) = (HIDDEN, 0.0);
+                    (*color, *metres) = (mark, 0.0);
                 }
             }
         }
@@ -239,12 +238,12 @@ mod tests {
         for (width, halved) in [(64, false), (32, true)] {
             let count = (width * width * 3 / 4) as usize;
             let mut pixels = Pixels { color: vec![7; count], depth_metres: vec![1.0; count] };
-            hidden.leave_out(&mut pixels, width, halved);
-            let is_left_out = |x: u32, y: u32| pixels.color[(y * width + x) as usize] == HIDDEN;
+            hidden.leave_out(&mut pixels, width, halved, 1);
+            let is_left_out = |x: u32, y: u32| pixels.color[(y * width + x) as usize] == 1;
             assert!(is_left_out(width * 9 / 16, width * 3 / 8) && !is_left_out(width * 7 / 16, width * 3 / 8));
             assert!(!is_left_out(width * 9 / 16, 0) && !is_left_out(width - 1, width * 3 / 8));
-            assert!(pixels.color.iter().zip(&pixels.depth_metres).all(|(color, metres)| (*color == HIDDEN) == (*metres == 0.0)));
-            shares.push(pixels.color.iter().filter(|color| **color != HIDDEN).count() as f32 / count as f32);
+            assert!(pixels.color.iter().zip(&pixels.depth_metres).all(|(color, metres)| (*color == 1) == (*metres == 0.0)));
+            shares.push(pixels.color.iter().filter(|color| **color != 1).count() as f32 / count as f32);
         }
         assert_eq!(shares, [hidden.seen(); 2]);
     }

@@ -9,6 +9,7 @@ use crate::mapping::image_store::ImageStore;
 use crate::mapping::keyframe::MappedKeyframe;
 use crate::mapping::{DensityConfig, MappingError};
 use crate::optimise::{AdamConfig, OverScores, Pixels, TrainingView};
+use crate::render::HIDDEN;
 
 impl Mapper {
     /// Takes steps, in batches, until `interlude` ends them.
@@ -57,10 +58,12 @@ impl Mapper {
         for (step, _) in batch.iter().zip(&hidden).filter(|(_, hidden)| hidden.is_some()) {
             self.keyframes[step.keyframe].offload(&self.gpu, &mut self.images)?;
         }
+        // In the final refinement, what reaches into them is taught by its own views in their turn.
+        let mark = if self.visits.is_empty() { HIDDEN } else { 0 };
         let streamed = batch
             .iter()
             .zip(hidden)
-            .map(|(step, hidden)| streamed(&self.keyframes[step.keyframe], step.coarse, hidden, &self.images));
+            .map(|(step, hidden)| streamed(&self.keyframes[step.keyframe], step.coarse, (hidden, mark), &self.images));
         let streamed = streamed.collect::<std::io::Result<Vec<_>>>()?;
         let views = batch.iter().zip(&streamed).map(|(step, pixels)| {
             let keyframe = &self.keyframes[step.keyframe];
@@ -94,13 +97,13 @@ impl Mapper {
 fn streamed<'a>(
     keyframe: &'a MappedKeyframe,
     coarse: bool,
-    hidden: Option<Hidden>,
+    (hidden, mark): (Option<Hidden>, u32),
     images: &ImageStore,
 ) -> std::io::Result<Option<Cow<'a, Pixels>>> {
     let mut pixels = keyframe.streamed(coarse, images)?;
     if let (Some(pixels), Some(hidden)) = (&mut pixels, hidden) {
         let width = keyframe.view(coarse).camera.pinhole.width;
-        hidden.leave_out(pixels.to_mut(), width, width < keyframe.camera.pinhole.width);
+        hidden.leave_out(pixels.to_mut(), width, width < keyframe.camera.pinhole.width, mark);
     }
     Ok(pixels)
 }
