@@ -303,6 +303,10 @@ fn a_full_disk() {
 #[cfg(target_os = "linux")]
 #[test]
 fn a_disk_that_fills_up_between_checkpoints() {
+    use std::fs::File;
+    use std::io::Write;
+    use std::time::Duration;
+
     if skipped_without_adapter() {
         return;
     }
@@ -317,10 +321,18 @@ fn a_disk_that_fills_up_between_checkpoints() {
     let (checkpoint, filler) = (out.join("checkpoint.bin"), disk.0.path().join("filler"));
     // The first one has no map yet.
     while std::fs::metadata(&checkpoint).map_or(0, |file| file.len()) < 100_000 {
-        std::thread::sleep(std::time::Duration::from_millis(1));
+        std::thread::sleep(Duration::from_millis(1));
     }
-    std::fs::write(&filler, vec![0; 64 << 20]).unwrap_err();
-    let said = finish_child(child, String::new());
+    // What the run frees meanwhile is filled as well.
+    let said = std::thread::scope(|scope| {
+        let run = scope.spawn(|| finish_child(child, String::new()));
+        let mut filler = File::create(&filler).unwrap();
+        while !run.is_finished() {
+            while filler.write_all(&[0; 4096]).is_ok() {}
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        run.join().unwrap()
+    });
     said.refused(&["cannot write", "free some space or write to another disk"]);
     let warnings = said.stderr.lines().filter(|line| line.contains("the run goes on"));
     assert!(warnings.clone().count() == 1 && warnings.clone().all(|line| line.contains("checkpoint.bin")), "{}", said.stderr);
