@@ -2,7 +2,7 @@
 """Estimate of a training step's time on GPUs: counted bytes and instructions over published rates.
 
 A stage takes the longer of its bytes over the bandwidth and its instructions over the issue rate, but not less than its longest chain of
-dependent iterations; commands add their launches. Prints a table. Bandwidth and launches of the H200 are measured; beside its estimate stands what its steps took
+dependent iterations; commands add their launches. Prints a table. Bandwidth of the H200 and launches of an H100 are measured; beside the H200's estimate stands what its steps took
 (benches/README.md), so that the estimates of the other GPUs can be judged.
 """
 

@@ -2,8 +2,11 @@
 // pixel of each.
 
 const THREADS: u32 = 2u * SUBTILE_PIXELS;
-// Gaussians in workgroup memory at a time; BUCKET is a multiple.
+// Gaussians in workgroup memory at a time.
 const BATCH: u32 = 48u;
+const_assert BUCKET % BATCH == 0u;
+// As many sub-tiles as the halves take.
+const_assert SUBTILES == 4u;
 // The sub-tiles that each Gaussian of the batch reaches.
 var<workgroup> batch_reach: array<u32, BATCH>;
 // A bit for each sub-tile whose pixels take more.
@@ -17,7 +20,7 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
     }
     let corner = corner_of(tile);
     let lane = local % SUBTILE_PIXELS;
-    let left = left_subtile(local);
+    let left = local / SUBTILE_PIXELS * SUBTILES_ACROSS;
     let at = vec2<f32>(pixel_of(corner, left, lane));
     let range = ranges[tile];
     let count = range.y - range.x;

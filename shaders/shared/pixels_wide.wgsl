@@ -25,7 +25,7 @@ const REACH_SLACK: f32 = 0.001;
 
 // Behind the rendered image, [buckets, CHECKPOINT, tile's pixels / 4]: where a bucket of BUCKET Gaussians begins within a tile's list, what each pixel has
 // blended before it: red, green, blue, depth, transmittance, and of a planar surface both slopes and z². Its number is its first place in the sorted list over
-// BUCKET. Of a pixel, which is a lane of the vector:
+// BUCKET. The vector of which a pixel is a lane:
 fn checkpoint_of(bucket: u32, plane: u32, pixel: u32) -> u32 {
     return IMAGE_PLANES * view.width * view.height + ((bucket * CHECKPOINT + plane) * SUBTILES * SUBTILE_PIXELS + pixel) / 4u;
 }
@@ -39,11 +39,6 @@ fn pixel_of(corner: vec2<u32>, subtile: u32, lane: u32) -> vec2<u32> {
     let x = subtile % SUBTILES_ACROSS * SUBTILE_WIDTH + lane % SUBTILE_WIDTH;
     let y = subtile / SUBTILES_ACROSS * SUBTILE_HEIGHT + lane / SUBTILE_WIDTH;
     return corner + vec2(x, y);
-}
-
-// Of the two sub-tiles of which an invocation has a pixel: a first half of a workgroup has the upper ones.
-fn left_subtile(local: u32) -> u32 {
-    return local / SUBTILE_PIXELS * SUBTILES_ACROSS;
 }
 
 fn is_on_image(pixel: vec2<u32>) -> bool {

@@ -7,8 +7,11 @@
 // [intersections, 12] what is summed: three vectors of four.
 @group(0) @binding(8) var<storage, read_write> intersection_sums: array<f32>;
 
-// Gaussians in workgroup memory at a time: with 24, the backward pass takes 4 KiB. BUCKET is a multiple.
+// Gaussians in workgroup memory at a time: with 24, the backward pass takes 4 KiB.
 const BATCH: u32 = 24u;
+const_assert BUCKET % BATCH == 0u;
+// As many sub-tiles as `main` names.
+const_assert SUBTILES == 4u;
 // Gaussians that are summed at a time.
 const TOGETHER: u32 = 2u;
 // An invocation sums one value: rows of this length lie in different banks.
@@ -91,8 +94,8 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
             let k = firstTrailingBit(left);
             left &= left - 1u;
             // BATCH where there is none.
-            let l = select(BATCH, firstTrailingBit(left), TOGETHER > 1u && left != 0u);
-            left = select(left, left & (left - 1u), TOGETHER > 1u);
+            let l = select(BATCH, firstTrailingBit(left), left != 0u);
+            left &= left - 1u;
             for (var t = 0u; t < TOGETHER; t++) {
                 let m = select(k, l, t > 0u);
                 if m == BATCH {

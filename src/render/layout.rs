@@ -77,7 +77,7 @@ pub const MOST_GRADIENT: f64 = 1e6;
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum BlendForm {
-    /// A pixel each, and sub-tiles of 8×4 pixels that a Gaussian does not reach are passed over; the backward pass takes a tile's list in buckets. For GPUs.
+    /// Single pixels of 8×4 sub-tiles; a Gaussian passes over the sub-tiles that it does not reach. The backward pass takes a tile's list in buckets. For GPUs.
     #[default]
     Wide,
     /// A block of 4×8 pixels each, four invocations a tile, two tiles a workgroup: every load from memory serves 32 pixels, and a Gaussian's gradient is summed
