@@ -6,8 +6,8 @@
 @group(0) @binding(2) var<storage, read> intersection_counts: array<u32>;
 @group(0) @binding(3) var<storage, read> intersection_scores: array<vec4<f32>>;
 @group(0) @binding(4) var<storage, read> projected: array<vec4<f32>>;
-// [2, capacity], see `GaussianScore`: (error pixels, the same times each view's loss, Σ w, largest w); (‖∂‖, ‖Σ|∂|‖ in normalised
-// device coordinates, views that blended it, finest metres per pixel).
+// [2, capacity], see `GaussianScore`: (error pixels, the same times each view's loss, Σ w, largest w); (‖∂‖ in normalised device coordinates, ‖Σ|∂|‖ of the
+// pixels' summed loss a pixel, views that blended it, finest metres per pixel).
 @group(0) @binding(5) var<storage, read_write> scores: array<vec4<f32>>;
 @group(0) @binding(6) var<uniform> setup: ScoreSetup;
 @group(0) @binding(7) var<uniform> total: vec4<f32>;
@@ -51,6 +51,6 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
         seen_before.z + blended.y,
         max(seen_before.w, blended.z),
     );
-    let norms = vec2(length(gradient.xy * per_unit), length(gradient.zw * per_unit));
+    let norms = vec2(length(gradient.xy * per_unit), length(gradient.zw) * setup.pixels);
     scores[view.capacity + i] = vec4(before.xy + norms, before.z + 1.0, finest);
 }

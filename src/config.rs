@@ -157,7 +157,8 @@ pub enum ConfigError {
 }
 
 /// Dotted keys of earlier versions, and those that replaced them; keys of a section before the section itself.
-const RENAMED: [(&str, &str); 17] = [
+const RENAMED: [(&str, &str); 18] = [
+    ("mapping.density.multi_view.absolute_gradient", "mapping.density.multi_view.pixel_gradient"),
     ("mapping.limits.max_keyframes", "mapping.limits.max_gpu_images"),
     ("mapping.density.vcd.min_worth", "mapping.density.multi_view.min_contribution"),
     ("mapping.density.vcd.wrong_pixels", "mapping.density.multi_view.error_pixels"),

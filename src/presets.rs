@@ -69,12 +69,13 @@ impl Preset {
     }
 }
 
-/// Denser insertion, less pruning, and more steps over all keyframes: so many after each keyframe, and epochs at the end.
+/// Denser insertion and growth, less pruning, and more steps over all keyframes: so many after each keyframe, and epochs at the end.
 fn refined(config: &mut Config, steps_per_keyframe: usize, final_epochs: usize) {
     let mapping = &mut config.mapping;
     (mapping.refine.steps_per_keyframe, mapping.refine.final_epochs) = (steps_per_keyframe, final_epochs);
     mapping.insertion.detail = 0.04;
-    mapping.density.multi_view.min_contribution = 0.5;
+    let rules = &mut mapping.density.multi_view;
+    (rules.min_contribution, rules.pixel_gradient) = (0.5, 0.6);
 }
 
 /// Shares of the recorded resolution that real time may choose.

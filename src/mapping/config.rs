@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{DensityConfig, ExposureConfig, LimitsConfig, PlaneSweepConfig};
+use super::{DensityConfig, ExposureConfig, LimitsConfig, MultiViewConfig, PlaneSweepConfig};
 use crate::optimise::{AdamConfig, LossConfig, PlanarConfig};
 use crate::splat::ShDegree;
 use crate::splat::model::Surface;
@@ -156,7 +156,7 @@ pub struct PointsConfig {
 
 impl Default for PointsConfig {
     fn default() -> Self {
-        Self { spacing_pixels: 8.0, footprint: 1.0, opacity: 0.3, size_range: 8.0 }
+        Self { spacing_pixels: 5.6, footprint: 1.0, opacity: 0.3, size_range: 8.0 }
     }
 }
 
@@ -213,7 +213,7 @@ impl Default for RefineConfig {
             density_views: 10,
             growth_share: 0.65,
             half_size_share: 0.0,
-            final_lr_scale_position: 0.02,
+            final_lr_scale_position: 0.1,
             final_lr_scale: 0.2,
             dropout: 0.0,
         }
@@ -228,10 +228,11 @@ impl MappingConfig {
         // Thousands of steps need lower rates, except for positions: points and inserted Gaussians lie further from where they belong than those
         // of a depth image do. The rates fall by themselves, which leaves averages nothing but to lag behind.
         let rates = AdamConfig { lr_position: 0.24, lr_harmonics: 0.015, ..AdamConfig::default() }.scaled(2.0 / 3.0, 2.0 / 3.0);
-        let adam = AdamConfig { color_settling_steps: 0.0, ema_steps: 1.0, ..rates };
-        // No keyframe inserts anything during the refinement: what the first Gaussians miss must grow out of them.
+        let adam = AdamConfig { color_settling_steps: 0.0, ema_steps: 1.0, beta_2: 0.99, ..rates };
+        // No keyframe inserts anything during the refinement: what the first Gaussians miss must grow out of them, where it is worth most.
         let mut density = DensityConfig::default();
-        density.multi_view.max_growth = 0.15;
+        let MultiViewConfig { max_growth, pixel_gradient, min_contribution, .. } = &mut density.multi_view;
+        (*max_growth, *pixel_gradient, *min_contribution) = (0.15, 1.25, 0.5);
         // Photos arrive before there is a map to compare them with.
         let exposure = ExposureConfig { refinements: 3, ..ExposureConfig::default() };
         Self { iterations_per_keyframe: 0, first_iterations: 0, exposure, refine, adam, density, ..Self::default() }

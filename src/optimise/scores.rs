@@ -33,10 +33,9 @@ pub struct GaussianScore {
     pub weight_sum: f32,
     /// Maximum of the blending weights, 0 to 1.
     pub weight_max: f32,
-    /// Sums over the views of the loss gradient by its image position, and of the sums of absolute gradients over its pixels;
-    /// normalised device coordinates, as 3DGS has them.
+    /// Sum over the views of the mean loss' gradient by its image position; normalised device coordinates, as 3DGS has it.
     pub gradient: f32,
-    /// Sum of absolute image-position gradients, normalised device coordinates.
+    /// Sum over the views of its pixels' absolute gradients: of the loss summed over the image, for a pixel of motion.
     pub absolute_gradient: f32,
     /// Views that blended it.
     pub views: f32,

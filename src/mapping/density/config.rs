@@ -66,8 +66,9 @@ pub struct MultiViewConfig {
     pub noise: f32,
     /// A Gaussian is split if it covers more error pixels than this in the mean of the views,
     pub error_pixels: f32,
-    /// its mean absolute gradient (normalised device coordinates) exceeds this,
-    pub absolute_gradient: f32,
+    /// its mean absolute gradient exceeds this: of the loss summed over the image's pixels, for a pixel of motion, so that it means the same at
+    /// any resolution,
+    pub pixel_gradient: f32,
     /// and its standard deviation this many pixels of the nearest view: finer detail than that no view shows.
     pub split_pixels: f32,
     /// At most this share of the scored Gaussians is divided at once, those with most error pixels first.
@@ -113,7 +114,7 @@ impl Default for MultiViewConfig {
             error_ratio: 1.5,
             noise: 0.02,
             error_pixels: 5.0,
-            absolute_gradient: 1.2e-3,
+            pixel_gradient: 0.6,
             split_pixels: 1.5,
             max_growth: 0.015,
             min_age: 2,
@@ -154,7 +155,7 @@ impl DensityConfig {
             min_contribution: v.min_contribution,
             faint_raw_opacity: raw_opacity_from_opacity(v.faint_opacity).max(f32::MIN),
             error_pixels: v.error_pixels,
-            absolute_gradient: v.absolute_gradient,
+            absolute_gradient: v.pixel_gradient,
             split_log_pixels: v.split_pixels.ln(),
             gradient: rules(DensityStrategy::Classic, c.gradient),
             split_or_clone_log_pixels: c.split_pixels.ln(),
@@ -198,7 +199,7 @@ impl DensityConfig {
         if let Some((name, value)) = positive.iter().find(|(_, value)| !(value.is_finite() && *value > 0.0)) {
             return Err(format!("{name} must be positive, not {value}"));
         }
-        let thresholds = [v.error_ratio, v.error_pixels, v.absolute_gradient, v.max_growth, v.min_contribution, c.gradient];
+        let thresholds = [v.error_ratio, v.error_pixels, v.pixel_gradient, v.max_growth, v.min_contribution, c.gradient];
         if thresholds.iter().any(|t| !(t.is_finite() && *t >= 0.0)) {
             return Err("thresholds must be finite and not negative".into());
         }

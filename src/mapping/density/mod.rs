@@ -60,7 +60,7 @@ fn chosen(marked: &[(u32, u32)], scored: usize, config: &DensityConfig) -> Vec<(
     let mut dividing: Vec<(u32, Division, f32)> = dividing.collect();
     let most = (config.multi_view.max_growth * scored as f32) as usize;
     if config.strategy == DensityStrategy::MultiView && dividing.len() > most {
-        dividing.sort_unstable_by(|a, b| b.2.total_cmp(&a.2).then(a.0.cmp(&b.0)));
+        dividing.select_nth_unstable_by(most, |a, b| b.2.total_cmp(&a.2).then(a.0.cmp(&b.0)));
         dividing.truncate(most);
         dividing.sort_unstable_by_key(|(i, ..)| *i);
     }

@@ -57,9 +57,9 @@ fn the_rules_are_those_of_the_configuration() {
     assert_eq!((setup.min_age, setup.gradient), (f32::MAX, config.classic.gradient), "one strategy rules");
     assert_eq!((setup.faint_raw_opacity, setup.split_log_pixels), (0.0, 0.0));
     assert!(setup.min_raw_opacity.is_finite(), "an infinity is no uniform");
-    let MultiViewConfig { min_weight, min_contribution, error_pixels, absolute_gradient, .. } = config.multi_view;
+    let MultiViewConfig { min_weight, min_contribution, error_pixels, pixel_gradient, .. } = config.multi_view;
     assert_eq!([setup.min_weight, setup.min_contribution], [min_weight, min_contribution]);
-    assert_eq!([setup.error_pixels, setup.absolute_gradient], [error_pixels, absolute_gradient]);
+    assert_eq!([setup.error_pixels, setup.absolute_gradient], [error_pixels, pixel_gradient]);
     assert_eq!(config.without_growth().setup(&MapSize { count: 7, capacity: 256, rounds: 3 }).gradient, f32::MAX);
 }
 

@@ -17,7 +17,7 @@ pub struct Score64 {
     pub weight_max: f64,
     /// Normalised device coordinates.
     pub gradient: f64,
-    /// Sum of the pixels' absolute gradients, normalised device coordinates.
+    /// Sum of the pixels' absolute gradients, of the loss summed over the pixels, a pixel of motion.
     pub absolute_gradient: f64,
     /// Along z, metres.
     pub depth: f64,
@@ -53,9 +53,10 @@ pub fn scores(view: &View64, cloud: &[Gaussian64], by_image: &ImageGradient64, w
         }
     }
     let half = Vector2::new(f64::from(p.width), f64::from(p.height)) * 0.5;
+    let pixels = f64::from(p.width * p.height);
     for (i, score) in found.iter_mut().enumerate() {
         score.gradient = signed[i].component_mul(&half).norm();
-        score.absolute_gradient = absolute[i].component_mul(&half).norm();
+        score.absolute_gradient = absolute[i].norm() * pixels;
     }
     found
 }
