@@ -167,7 +167,7 @@ impl RunArgs {
         let recording = Recording::open(self.resolve(self.preset, None)?).into_diagnostic()?;
         let gpu = Gpu::open(recording.config().adapter.as_deref()).into_diagnostic()?;
         let free = self.config.is_none() && self.refine.is_none();
-        let preset = self.preset.or_else(|| (free && !self.known_poses).then(|| Preset::for_adapter(&gpu.adapter)));
+        let preset = self.preset.or_else(|| free.then(|| Preset::for_adapter(&gpu.adapter)));
         let scale = match self.preset {
             _ if self.map_scale.is_some() => None,
             Some(Preset::Realtime) => Some(presets::realtime_scale(&gpu, &recording).into_diagnostic()?),
