@@ -2,6 +2,7 @@
 # Runs a plan on a real Slurm of three one-core nodes on this machine, causes one fault at a time, and compares what it ends in with an
 # unbroken run: the same digest of the results, or the hole named. Root; slurm-wlm and munge.
 # usage: [PLAN=cells] scripts/slurm-faults.sh [TASKS [FAULT]...]
+# Beside the faults, one-node, two-nodes and three-nodes take the time on so many nodes of one core. Planning and merging are timed apart.
 # The plan is a sweep of so many runs, or with PLAN=cells the refinement of one run's map in so many cells.
 set -euo pipefail
 
@@ -158,6 +159,17 @@ poison() {
     submit
 }
 two-submissions() { submit & submit & wait; }
+# No faults, but times: on so many of the nodes, whose adapter has one core.
+on_nodes() {
+    local drained=$1
+    [ -z "$drained" ] || scontrol update NodeName="$drained" State=DRAIN Reason=times
+    LP_NUM_THREADS=1 submit
+    wait_until 1500 jobs_over || true
+    [ -z "$drained" ] || scontrol update NodeName="$drained" State=RESUME
+}
+one-node() { on_nodes n2,n3; }
+two-nodes() { on_nodes n3; }
+three-nodes() { on_nodes ""; }
 
 start_slurm
 plan=$work/plan
@@ -179,7 +191,9 @@ if [ "$kind" = cells ]; then
     cp -r "$work/original" "$work/room"
     "$keysplat" -q run "$work/room" --out "$work/run" --map-scale 1 --set mapping.refine.final_epochs=4 >/dev/null
 fi
-printf '%-16s %7s %5s %6s  %-16s %-17s %s\n' fault seconds done failed digest '' holes
+now() { date +%s%N; }
+since() { local tenths=$((($(now) - $1) / 100000000)) && echo "$((tenths / 10)).$((tenths % 10))"; }
+printf '%-16s %7s %5s %5s %5s %6s  %-16s %-17s %s\n' fault seconds plan merge done failed digest '' holes
 whole='' long='' failed=0
 for fault in "${faults[@]}"; do
     wait_until 60 all_idle || true
@@ -194,21 +208,25 @@ for fault in "${faults[@]}"; do
         fi
         expected=$long
     else
+        began=$(now)
         new_plan "${EPOCHS:-60}" "$tasks"
+        planned=$(since "$began")
     fi
     began=$SECONDS
     "$fault"
     wait_until 1500 jobs_over || echo "jobs remain" >&2
     seconds=$((SECONDS - began)) found=$(digest)
     [ "$fault" != none ] || { whole=$found expected=$found; }
+    merging=$(now)
     holes=$("$keysplat" -q jobs merge "$plan" 2>&1 | grep -o 'hole: task.*' | head -2 | paste -sd';' || true)
+    merged=$(since "$merging")
     ended=$(status_of | tail -1)
     [[ $ended = digest* ]] && ended=$(status_of | tail -2 | head -1)
     done=${ended%% done*} bad=$(sed 's/.*running, \([0-9]*\) failed.*/\1/' <<<"$ended")
     verdict='hole named'
     [ -z "$found" ] || [ "$found" != "$expected" ] || verdict="same digest"
     [ "$verdict" = "same digest" ] || [ -n "$holes" ] || { verdict=DIFFERS && failed=1; }
-    printf '%-16s %7d %5s %6s  %-16s %-17s %s\n' "$fault" "$seconds" "$done" "$bad" "${found:0:16}" "$verdict" "${holes:0:300}"
+    printf '%-16s %7d %5s %5s %5s %6s  %-16s %-17s %s\n' "$fault" "$seconds" "${planned:-}" "$merged" "$done" "$bad" "${found:0:16}" "$verdict" "${holes:0:300}"
     # What was in the way is gone: the holes fill, to the same digest.
     if [ -n "$holes" ] && [[ $fault != poison ]]; then
         umount "$plan/tasks/0003" 2>/dev/null || true
@@ -218,7 +236,7 @@ for fault in "${faults[@]}"; do
         verdict=DIFFERS
         [ "$(digest)" != "$expected" ] || verdict='same digest'
         [ "$verdict" = 'same digest' ] || failed=1
-        printf '%-16s %7d %5s %6s  %-16s %-17s\n' '  submitted again' "$((SECONDS - began))" '' '' "$(digest | cut -c1-16)" "$verdict"
+        printf '%-16s %7d %5s %5s %5s %6s  %-16s %-17s\n' '  submitted again' "$((SECONDS - began))" '' '' '' '' "$(digest | cut -c1-16)" "$verdict"
     fi
 done
 exit "$failed"
