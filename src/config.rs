@@ -139,7 +139,7 @@ pub enum ConfigError {
     #[error("{0}")]
     Value(String),
     /// A key of an earlier version.
-    #[error("`{old}` is called `{new}` now")]
+    #[error("`{old}` is called `{new}` now; CHANGELOG.md says whether its unit differs")]
     Renamed {
         /// Dotted key as found.
         old: &'static str,

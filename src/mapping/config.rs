@@ -226,10 +226,11 @@ impl MappingConfig {
         let refine =
             RefineConfig { steps_per_keyframe: 0, final_epochs: 0, steps: 6000, half_size_share: 0.3, ..RefineConfig::default() };
         // Thousands of steps need lower rates, except for positions: points and inserted Gaussians lie further from where they belong than those
-        // of a depth image do. The rates fall by themselves, which leaves averages nothing but to lag behind.
+        // of a depth image do. The rates fall by themselves, which leaves averages nothing but to lag behind. Second
+        // moments remember a hundred steps.
         let rates = AdamConfig { lr_position: 0.24, lr_harmonics: 0.015, ..AdamConfig::default() }.scaled(2.0 / 3.0, 2.0 / 3.0);
         let adam = AdamConfig { color_settling_steps: 0.0, ema_steps: 1.0, beta_2: 0.99, ..rates };
-        // No keyframe inserts anything during the refinement: what the first Gaussians miss must grow out of them, where it is worth most.
+        // No keyframe inserts anything during the refinement: what the first Gaussians miss must grow out of them, and only steep ones divide.
         let mut density = DensityConfig::default();
         let MultiViewConfig { max_growth, pixel_gradient, min_contribution, .. } = &mut density.multi_view;
         (*max_growth, *pixel_gradient, *min_contribution) = (0.15, 1.25, 0.5);
