@@ -9,6 +9,7 @@ mod error;
 mod files;
 mod layouts;
 mod rectify;
+mod sampling;
 mod stereo;
 
 use std::path::{Path, PathBuf};
@@ -92,6 +93,11 @@ impl DepthImage {
     pub fn at(&self, x: u32, y: u32) -> Option<f32> {
         let metres = self.metres[(y * self.width + x) as usize];
         (metres > 0.0).then_some(metres)
+    }
+
+    /// Forgets the depth of pixels that are not valid, `[height * width]`.
+    fn keep(&mut self, valid: &[bool]) {
+        self.metres.iter_mut().zip(valid).filter(|(_, valid)| !**valid).for_each(|(metres, _)| *metres = 0.0);
     }
 }
 

@@ -2,14 +2,12 @@
 
 use std::sync::Arc;
 
-use image::{GrayImage, ImageBuffer, Pixel, Rgb, RgbImage};
+use image::{GrayImage, RgbImage};
 use nalgebra::Vector2;
 
+use super::sampling::Sampler;
 use super::{DepthImage, Frame};
 use crate::geometry::{Camera, Pinhole};
-
-/// Depths further apart than this share (of the nearest) lie on different surfaces and are not averaged.
-const SAME_SURFACE: f32 = 0.03;
 
 /// A frame seen through an ideal pinhole.
 #[derive(Clone, Debug)]
@@ -37,7 +35,7 @@ impl RectifiedImage {
             None => to.clone(),
         };
         if let Some(depth) = &mut self.depth {
-            depth.metres.iter_mut().zip(&*valid).filter(|(_, valid)| !**valid).for_each(|(metres, _)| *metres = 0.0);
+            depth.keep(&valid);
         }
         self.valid = Some(valid);
     }
@@ -55,9 +53,8 @@ impl RectifiedImage {
 #[derive(Clone, Debug)]
 pub struct Rectifier {
     pinhole: Pinhole,
-    /// `[height * width * samples²]` positions in the recorded image, grouped by mapping pixel.
-    sources: Vec<[f32; 2]>,
-    samples: usize,
+    /// Positions in the recorded image, a group for each mapping pixel.
+    sampler: Sampler,
     /// Mapping pixels per recorded pixel along x and y.
     scale: Vector2<f64>,
     /// Pixels whose centre lies in the recorded image; `None`: all.
@@ -76,7 +73,8 @@ impl Rectifier {
         // One bilinear sample per recorded pixel that a mapping pixel covers: a box filter.
         let samples = (1.0 / scale).round().max(1.0) as usize;
         let pixels = pinhole.width as usize * pinhole.height as usize;
-        let mut sources = Vec::with_capacity(pixels * samples * samples);
+        let group = samples * samples;
+        let mut sources = Vec::with_capacity(pixels * group);
         let mut valid = Vec::with_capacity(pixels);
         let full = &camera.pinhole;
         let in_full = |ideal: Vector2<f64>| {
@@ -86,7 +84,7 @@ impl Rectifier {
         for y in 0..pinhole.height {
             for x in 0..pinhole.width {
                 let ideal = Vector2::new(f64::from(x), f64::from(y));
-                for sample in 0..samples * samples {
+                for sample in 0..group {
                     let offset = |k: usize| (k as f64 + 0.5) / samples as f64 - 0.5;
                     let source =
                         camera.distort_pixel(&in_full(ideal + Vector2::new(offset(sample % samples), offset(sample / samples))));
@@ -99,7 +97,8 @@ impl Rectifier {
         }
         let scale = Vector2::new(pinhole.fx / camera.pinhole.fx, pinhole.fy / camera.pinhole.fy);
         let valid = valid.contains(&false).then(|| valid.into());
-        Self { pinhole, sources, samples, scale, valid }
+        let sampler = Sampler::new((full.width, full.height), &sources, group);
+        Self { pinhole, sampler, scale, valid }
     }
 
     /// The ideal pinhole of the rectified images.
@@ -110,36 +109,28 @@ impl Rectifier {
     /// Resamples colour (box filter over bilinear samples; the border repeats) and depth (mean over the nearest surface; 0 at pixels that
     /// are not valid). Pixels that the mask does not keep are not valid.
     pub fn rectify(&self, frame: &Frame) -> RectifiedImage {
-        let mut color = RgbImage::new(self.pinhole.width, self.pinhole.height);
-        let group = self.samples * self.samples;
-        for (pixel, sources) in color.pixels_mut().zip(self.sources.chunks_exact(group)) {
-            *pixel = Rgb(box_filter(&frame.color, sources));
-        }
+        let Pinhole { width, height, .. } = self.pinhole;
+        let color = RgbImage::from_raw(width, height, self.sampler.means::<3>(&frame.color)).expect("a group for each pixel");
         let valid = frame.mask.as_ref().map_or_else(|| self.valid.clone(), |mask| self.valid_and_kept(mask));
-        let mut image = RectifiedImage { pinhole: self.pinhole, color, depth: None, valid };
-        image.depth = frame.depth.as_ref().map(|depth| {
-            let at = |(i, sources): (usize, _)| if image.is_valid(i) { nearest_surface(depth, sources) } else { 0.0 };
-            let metres = self.sources.chunks_exact(group).enumerate().map(at).collect();
-            DepthImage { width: self.pinhole.width, height: self.pinhole.height, metres }
+        let depth = frame.depth.as_ref().map(|depth| {
+            let mut depth = DepthImage { width, height, metres: self.sampler.nearest_surfaces(depth) };
+            valid.iter().for_each(|valid| depth.keep(valid));
+            depth
         });
-        image
+        RectifiedImage { pinhole: self.pinhole, color, depth, valid }
     }
 
     /// The valid pixels all of whose recorded pixels the mask keeps; `None`: all.
     fn valid_and_kept(&self, mask: &GrayImage) -> Option<Arc<[bool]>> {
-        let (right, bottom) = (mask.width() as f32 - 1.0, mask.height() as f32 - 1.0);
-        let kept =
-            |[x, y]: &[f32; 2]| mask.get_pixel(x.round().clamp(0.0, right) as u32, y.round().clamp(0.0, bottom) as u32).0[0] > 0;
-        let groups = self.sources.chunks_exact(self.samples * self.samples).enumerate();
-        let valid: Arc<[bool]> =
-            groups.map(|(i, sources)| self.valid.as_ref().is_none_or(|valid| valid[i]) && sources.iter().all(kept)).collect();
+        let kept = self.sampler.kept(mask).enumerate();
+        let valid: Arc<[bool]> = kept.map(|(i, kept)| kept && self.valid.as_ref().is_none_or(|valid| valid[i])).collect();
         valid.contains(&false).then_some(valid)
     }
 
     /// The right image of a pair, whose camera is like the left one.
     pub fn rectify_right(&self, right: &GrayImage) -> GrayImage {
-        let pixels = self.sources.chunks_exact(self.samples * self.samples).map(|sources| box_filter::<_, 1>(right, sources)[0]);
-        GrayImage::from_raw(self.pinhole.width, self.pinhole.height, pixels.collect()).expect("one group a pixel")
+        let Pinhole { width, height, .. } = self.pinhole;
+        GrayImage::from_raw(width, height, self.sampler.means::<1>(right)).expect("a group for each pixel")
     }
 
     /// A depth image of a few points alone: pixels of the recorded camera without its distortion, and metres along z.
@@ -187,46 +178,10 @@ impl Rectifiers {
     }
 }
 
-/// Mean of bilinear samples.
-fn box_filter<P: Pixel<Subpixel = u8>, const C: usize>(image: &ImageBuffer<P, Vec<u8>>, sources: &[[f32; 2]]) -> [u8; C] {
-    let mut sum = [0.0f32; C];
-    for source in sources {
-        let value: [f32; C] = bilinear(image, *source);
-        (0..C).for_each(|c| sum[c] += value[c]);
-    }
-    sum.map(|v| (v / sources.len() as f32 + 0.5) as u8)
-}
-
-/// The `C` channels at a position in pixels; beyond the border its values go on.
-pub(super) fn bilinear<P: Pixel<Subpixel = u8>, const C: usize>(image: &ImageBuffer<P, Vec<u8>>, [x, y]: [f32; 2]) -> [f32; C] {
-    let (x, y) = (x.clamp(0.0, image.width() as f32 - 1.0), y.clamp(0.0, image.height() as f32 - 1.0));
-    let (x0, y0) = (x as u32, y as u32);
-    let (x1, y1) = ((x0 + 1).min(image.width() - 1), (y0 + 1).min(image.height() - 1));
-    let (u, v) = (x - x0 as f32, y - y0 as f32);
-    let at = |x, y, c: usize| f32::from(image.get_pixel(x, y).channels()[c]);
-    std::array::from_fn(|c| {
-        (at(x0, y0, c) * (1.0 - u) + at(x1, y0, c) * u) * (1.0 - v) + (at(x0, y1, c) * (1.0 - u) + at(x1, y1, c) * u) * v
-    })
-}
-
-/// Mean of the samples on the nearest surface: averaging across a depth edge would invent points in mid-air.
-fn nearest_surface(depth: &DepthImage, sources: &[[f32; 2]]) -> f32 {
-    let at = |&[x, y]: &[f32; 2]| {
-        let (x, y) = (x.round(), y.round());
-        let inside = x >= 0.0 && y >= 0.0 && x < depth.width as f32 && y < depth.height as f32;
-        inside.then(|| depth.at(x as u32, y as u32)).flatten()
-    };
-    let nearest = sources.iter().filter_map(at).fold(f32::INFINITY, f32::min);
-    let (mut sum, mut count) = (0.0, 0.0);
-    for metres in sources.iter().filter_map(at).filter(|m| *m <= nearest * (1.0 + SAME_SURFACE)) {
-        sum += metres;
-        count += 1.0;
-    }
-    if count > 0.0 { sum / count } else { 0.0 }
-}
-
 #[cfg(test)]
 mod tests {
+    use image::Rgb;
+
     use super::*;
     use crate::geometry::Distortion;
 

@@ -7,7 +7,8 @@
 use image::{DynamicImage, GrayImage, ImageBuffer, Luma, Pixel, Rgb, RgbImage};
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector2, Vector3};
 
-use super::{checks, rectify};
+use super::checks;
+use super::sampling::Sampler;
 use crate::geometry::{Camera, Distortion, Pinhole, Se3};
 
 /// Cameras that must turn further than this are not side by side.
@@ -25,11 +26,11 @@ pub struct StereoRectification {
     pub remap: StereoRemap,
 }
 
-/// For each rectified pixel, where it lies in the recorded image: `[height * width]` positions, row-major.
+/// For each rectified pixel, where it lies in the recorded image.
 #[derive(Debug)]
 pub struct StereoRemap {
-    left: Vec<[f32; 2]>,
-    right: Vec<[f32; 2]>,
+    left: Sampler,
+    right: Sampler,
 }
 
 impl StereoRemap {
@@ -48,14 +49,10 @@ impl StereoRemap {
 }
 
 fn resample<P: Pixel<Subpixel = u8>, const C: usize>(
-    sources: &[[f32; 2]],
+    sampler: &Sampler,
     image: &ImageBuffer<P, Vec<u8>>,
 ) -> ImageBuffer<P, Vec<u8>> {
-    let mut values = Vec::with_capacity(sources.len() * C);
-    for source in sources {
-        values.extend(rectify::bilinear::<P, C>(image, *source).map(|value| (value + 0.5) as u8));
-    }
-    ImageBuffer::from_raw(image.width(), image.height(), values).expect("a source for each pixel")
+    ImageBuffer::from_raw(image.width(), image.height(), sampler.means::<C>(image)).expect("a sample for each pixel")
 }
 
 /// Rectifies two cameras of the same size; says what is wrong where they are no stereo pair.
@@ -68,8 +65,8 @@ pub fn rectify(left: &Camera, right: &Camera, left_from_right: &Se3) -> Result<S
     let rectified_from_right = rectified_from_left * left_from_right.rotation;
     let pinhole = common_pinhole(&[(left, rectified_from_left), (right, rectified_from_right)])?;
     let remap = StereoRemap {
-        left: sources(&pinhole, left, &rectified_from_left)?,
-        right: sources(&pinhole, right, &rectified_from_right)?,
+        left: sampler(&pinhole, left, &rectified_from_left)?,
+        right: sampler(&pinhole, right, &rectified_from_right)?,
     };
     Ok(StereoRectification { pinhole, baseline_metres: left_from_right.translation.vector.norm(), rectified_from_left, remap })
 }
@@ -118,7 +115,7 @@ fn common_pinhole(cameras: &[(&Camera, UnitQuaternion<f64>)]) -> Result<Pinhole,
 }
 
 /// Where each pixel of the rectified pinhole lies in the camera's recorded image.
-fn sources(pinhole: &Pinhole, camera: &Camera, rectified_from_camera: &UnitQuaternion<f64>) -> Result<Vec<[f32; 2]>, String> {
+fn sampler(pinhole: &Pinhole, camera: &Camera, rectified_from_camera: &UnitQuaternion<f64>) -> Result<Sampler, String> {
     let camera_from_rectified = rectified_from_camera.inverse();
     let mut sources = Vec::with_capacity(pinhole.width as usize * pinhole.height as usize);
     for y in 0..pinhole.height {
@@ -130,7 +127,7 @@ fn sources(pinhole: &Pinhole, camera: &Camera, rectified_from_camera: &UnitQuate
             sources.push([source.x as f32, source.y as f32]);
         }
     }
-    Ok(sources)
+    Ok(Sampler::new((camera.pinhole.width, camera.pinhole.height), &sources, 1))
 }
 
 #[cfg(test)]
@@ -186,7 +183,9 @@ mod tests {
             // `distance` is the depth along the rectified axis, as `ray` has z = 1 there.
             let in_right = f64::from(x) - pair.pinhole.fx * pair.baseline_metres / distance;
             if in_right >= 0.0 {
-                let [value] = rectify::bilinear::<_, 1>(&right, [in_right as f32, y as f32]);
+                let [value] = Sampler::new(right.dimensions(), &[[in_right as f32, y as f32]], 1).means::<1>(&right)[..] else {
+                    panic!()
+                };
                 assert!((f64::from(value) - expected).abs() < 3.0, "right of {x},{y}: {value} for {expected:.1}");
             }
         }
