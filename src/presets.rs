@@ -57,7 +57,6 @@ impl Preset {
             }
             Self::Draft => {
                 // With so few steps a keyframe's own are best kept for the end.
-                mapping.first_iterations = 20;
                 mapping.iterations_per_keyframe = 3;
                 mapping.refine.steps_per_keyframe = 0;
                 mapping.refine.final_epochs = 6;

@@ -17,93 +17,107 @@ const MIN_TURN_RAD: f64 = 0.5 * std::f64::consts::PI / 180.0;
 /// As far as [`MIN_SHIFT_METRES`] at the two metres of a room.
 const MIN_LOG_SCALE: f64 = 0.005;
 
+/// Keyframe of a Gaussian; the highest bit is set where no step moves the Gaussian.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+struct Anchor(u32);
+
+const FIXED: u32 = 1 << 31;
+
+impl Anchor {
+    /// Of a Gaussian that steps move.
+    fn new(keyframe: KeyframeId) -> Self {
+        Self(u32::try_from(keyframe).ok().filter(|id| id & FIXED == 0).expect("a recording has fewer than 2³¹ keyframes"))
+    }
+
+    fn keyframe(self) -> KeyframeId {
+        (self.0 & !FIXED) as KeyframeId
+    }
+
+    fn is_fixed(self) -> bool {
+        self.0 & FIXED != 0
+    }
+}
+
 /// What the mapper knows of each Gaussian, `[N]` in map order. Inserted Gaussians are appended and pruning keeps the order, so most of a keyframe's
 /// Gaussians lie side by side.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
-pub(super) struct Anchors {
-    keyframes: Vec<KeyframeId>,
-    /// Whether no step moves it.
-    fixed: Vec<bool>,
-}
+pub(super) struct Anchors(Vec<Anchor>);
 
 impl Anchors {
     /// The newest `count` Gaussians are of `keyframe`.
     pub fn append(&mut self, keyframe: KeyframeId, count: usize) {
-        self.put_back(&vec![keyframe; count]);
+        self.0.resize(self.0.len() + count, Anchor::new(keyframe));
     }
 
     /// Gaussians that come back, of these keyframes.
     pub fn put_back(&mut self, keyframes: &[KeyframeId]) {
-        self.keyframes.extend_from_slice(keyframes);
-        self.fixed.resize(self.keyframes.len(), false);
+        self.0.extend(keyframes.iter().map(|keyframe| Anchor::new(*keyframe)));
     }
 
-    /// Follows a plan: children are of their parent's keyframe.
+    /// Follows a plan: children are as their parent, and what lies between two that go moves up as one piece.
     pub fn apply(&mut self, plan: &Plan) {
-        apply(&mut self.keyframes, plan);
-        apply(&mut self.fixed, plan);
+        let each = &mut self.0;
+        let children: Vec<Anchor> = plan.divided.iter().flat_map(|(parent, _)| [each[*parent as usize]; 2]).collect();
+        let ends = plan.removed.iter().skip(1).map(|i| *i as usize).chain([each.len()]);
+        let mut kept = plan.removed.first().map_or(each.len(), |first| *first as usize);
+        for (removed, end) in plan.removed.iter().zip(ends) {
+            let piece = *removed as usize + 1..end;
+            let length = piece.len();
+            each.copy_within(piece, kept);
+            kept += length;
+        }
+        each.truncate(kept);
+        each.extend(children);
     }
 
     /// The Gaussians of some keyframes, ascending.
     pub fn of(&self, keyframes: &BTreeSet<KeyframeId>) -> Vec<u32> {
-        (0..).zip(&self.keyframes).filter(|(_, keyframe)| keyframes.contains(keyframe)).map(|(gaussian, _)| gaussian).collect()
+        self.places(|anchor| keyframes.contains(&anchor.keyframe())).collect()
     }
 
     /// The keyframes of some Gaussians.
     pub fn at(&self, places: &[u32]) -> Vec<KeyframeId> {
-        places.iter().map(|place| self.keyframes[*place as usize]).collect()
+        places.iter().map(|place| self.keyframe(*place)).collect()
     }
 
     /// The keyframe of a Gaussian.
     pub fn keyframe(&self, place: u32) -> KeyframeId {
-        self.keyframes[place as usize]
+        self.0[place as usize].keyframe()
     }
 
     pub fn len(&self) -> usize {
-        self.keyframes.len()
+        self.0.len()
     }
 
     /// No step moves the Gaussians at these places from now on, and only these.
     pub fn fix(&mut self, places: &[u32]) {
-        self.fixed.fill(false);
-        places.iter().for_each(|place| self.fixed[*place as usize] = true);
+        self.0.iter_mut().for_each(|anchor| anchor.0 &= !FIXED);
+        places.iter().for_each(|place| self.0[*place as usize].0 |= FIXED);
     }
 
     /// Those that no step moves, ascending.
     pub fn fixed(&self) -> impl Iterator<Item = u32> + '_ {
-        (0..).zip(&self.fixed).filter(|(_, fixed)| **fixed).map(|(gaussian, _)| gaussian)
+        self.places(|anchor| anchor.is_fixed())
+    }
+
+    fn places(&self, which: impl Fn(Anchor) -> bool) -> impl Iterator<Item = u32> {
+        (0..).zip(&self.0).filter(move |(_, anchor)| which(**anchor)).map(|(place, _)| place)
     }
 
     /// The runs of Gaussians whose keyframe has moved, ascending. Those that steps move follow `motions`, beyond a refinement; the fixed ones, which
     /// no step takes along, follow `each`.
     pub fn moved(&self, motions: &BTreeMap<KeyframeId, Sim3>, each: &BTreeMap<KeyframeId, Sim3>) -> Vec<RunMotion> {
-        let alike: Vec<(KeyframeId, bool)> = self.keyframes.iter().copied().zip(self.fixed.iter().copied()).collect();
         let mut runs = Vec::new();
         let mut first = 0;
-        for run in alike.chunk_by(|a, b| a == b) {
-            let (keyframe, is_fixed) = run[0];
-            let motion = if is_fixed { each } else { motions }.get(&keyframe);
+        for run in self.0.chunk_by(|a, b| a == b) {
+            let keyframe = run[0].keyframe();
+            let motion = if run[0].is_fixed() { each } else { motions }.get(&keyframe);
             let clears_moments = motions.contains_key(&keyframe);
             runs.extend(motion.map(|motion| RunMotion { run: first..first + run.len(), new_from_old: *motion, clears_moments }));
             first += run.len();
         }
         runs
     }
-}
-
-/// What lies between two that go moves up, as one piece; a child is as its parent.
-fn apply<T: Copy>(each: &mut Vec<T>, plan: &Plan) {
-    let children: Vec<T> = plan.divided.iter().flat_map(|(parent, _)| [each[*parent as usize]; 2]).collect();
-    let ends = plan.removed.iter().skip(1).map(|i| *i as usize).chain([each.len()]);
-    let mut kept = plan.removed.first().map_or(each.len(), |first| *first as usize);
-    for (removed, end) in plan.removed.iter().zip(ends) {
-        let piece = *removed as usize + 1..end;
-        let length = piece.len();
-        each.copy_within(piece, kept);
-        kept += length;
-    }
-    each.truncate(kept);
-    each.extend(children);
 }
 
 /// new_from_old, how a world moves that is held by a camera, when distances from the camera grow by a factor; `None` if that is no more
@@ -138,7 +152,8 @@ mod tests {
         [(0, 4), (2, 3), (5, 2)].into_iter().for_each(|(keyframe, count)| anchors.append(keyframe, count));
         let divided = vec![(1, Division::Split), (5, Division::Clone)];
         anchors.apply(&Plan { removed: vec![1, 2, 5, 7], divided });
-        assert_eq!(anchors.keyframes, [0, 0, 2, 2, 5, 0, 0, 2, 2]);
+        let keyframes = |anchors: &Anchors| anchors.at(&(0..anchors.len() as u32).collect::<Vec<_>>());
+        assert_eq!(keyframes(&anchors), [0, 0, 2, 2, 5, 0, 0, 2, 2]);
         let new_from_old = Sim3::from(Se3::translation(1.0, 0.0, 0.0));
         let motions = [2, 5, 7].map(|keyframe| (keyframe, new_from_old)).into();
         let none = BTreeMap::new();
@@ -151,7 +166,7 @@ mod tests {
         assert_eq!(anchors.moved(&motions, &motions), [2..3, 3..4, 4..5, 7..8, 8..9].map(run(true)));
         assert_eq!(anchors.of(&[2, 5, 7].into()), [2, 3, 4, 7, 8]);
         anchors.apply(&Plan::removing(vec![0, 7]));
-        assert_eq!((&*anchors.keyframes, anchors.fixed().collect()), (&[0, 2, 2, 5, 0, 0, 2][..], vec![2, 6]));
+        assert_eq!((keyframes(&anchors), anchors.fixed().collect()), (vec![0, 2, 2, 5, 0, 0, 2], vec![2, 6]));
         anchors.apply(&Plan::default());
         assert_eq!(anchors.len(), 7);
     }

@@ -53,12 +53,12 @@ pub struct MappingConfig {
 impl Default for MappingConfig {
     fn default() -> Self {
         Self {
-            sh_degree: ShDegree::new(2).expect("degrees 0 to 3 exist"),
+            sh_degree: ShDegree::new(3).expect("degrees 0 to 3 exist"),
             antialiased: false,
             surface: Surface::default(),
             planar: PlanarConfig::default(),
-            iterations_per_keyframe: 5,
-            first_iterations: 50,
+            iterations_per_keyframe: 4,
+            first_iterations: 20,
             yields_to_keyframes: false,
             seed: 0,
             window: WindowConfig::default(),
@@ -206,7 +206,7 @@ impl Default for RefineConfig {
     fn default() -> Self {
         Self {
             steps_per_keyframe: 8,
-            final_epochs: 15,
+            final_epochs: 13,
             steps: 0,
             seconds: None,
             density_every: 200,
@@ -228,7 +228,7 @@ impl MappingConfig {
         // Thousands of steps need lower rates, except for positions: points and inserted Gaussians lie further from where they belong than those
         // of a depth image do. The rates fall by themselves, which leaves averages nothing but to lag behind. Second
         // moments remember a hundred steps.
-        let rates = AdamConfig { lr_position: 0.24, lr_harmonics: 0.015, ..AdamConfig::default() }.scaled(2.0 / 3.0, 2.0 / 3.0);
+        let rates = AdamConfig { lr_position: 0.24, ..AdamConfig::default() }.scaled(2.0 / 3.0, 2.0 / 3.0);
         let adam = AdamConfig { color_settling_steps: 0.0, ema_steps: 1.0, beta_2: 0.99, ..rates };
         // No keyframe inserts anything during the refinement: what the first Gaussians miss must grow out of them, and only steep ones divide.
         let mut density = DensityConfig::default();
@@ -236,7 +236,9 @@ impl MappingConfig {
         (*max_growth, *pixel_gradient, *min_contribution) = (0.15, 1.25, 0.5);
         // Photos arrive before there is a map to compare them with.
         let exposure = ExposureConfig { refinements: 3, ..ExposureConfig::default() };
-        Self { iterations_per_keyframe: 0, first_iterations: 0, exposure, refine, adam, density, ..Self::default() }
+        // As the settings around it were chosen.
+        let sh_degree = ShDegree::new(2).expect("degrees 0 to 3 exist");
+        Self { sh_degree, iterations_per_keyframe: 0, first_iterations: 0, exposure, refine, adam, density, ..Self::default() }
     }
 
     /// A copy for a world of `units_per_metre` units to a metre: every length is converted.

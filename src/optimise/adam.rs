@@ -49,7 +49,7 @@ impl Default for AdamConfig {
             lr_log_scale: 0.09,
             lr_rotation: 0.018,
             lr_color: 0.03,
-            lr_harmonics: 0.03,
+            lr_harmonics: 0.015,
             harmonics_every: 1,
             beta_1: 0.8,
             beta_2: 0.999,

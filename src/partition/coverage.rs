@@ -2,6 +2,9 @@
 //!
 //! Neither a GPU nor the whole map's place on one is needed. Each Gaussian is taken as round, with the geometric mean of its two longer axes.
 
+use glam::Vec3;
+
+use crate::geometry::Pinhole;
 use crate::splat::model::NEAR_METRES;
 use crate::splat::{GaussianCloud, ViewCamera, opacity_from_raw};
 
@@ -40,11 +43,10 @@ struct Seen {
 impl Coverage {
     /// Renders a map in blocks.
     pub fn of(cloud: &GaussianCloud, camera: &ViewCamera) -> Self {
-        let pinhole = &camera.pinhole;
-        let (columns, rows) = (pinhole.width.div_ceil(BLOCK), pinhole.height.div_ceil(BLOCK));
+        let [columns, rows] = size(&camera.pinhole);
         let mut coverage = Self { columns, rows, shares: Vec::new() };
         let mut transmittance = vec![1.0f32; (columns * rows) as usize];
-        for seen in seen(cloud, camera, (columns, rows)) {
+        for seen in seen(cloud, camera) {
             let variance = seen.variance + BLOCK_VARIANCE;
             let peak = seen.opacity * seen.variance / variance;
             let radius = EXTENT * variance.sqrt();
@@ -60,6 +62,12 @@ impl Coverage {
             }
         }
         coverage
+    }
+
+    /// Whether one of some Gaussians is in a camera's view, in front of others or not.
+    pub fn any_in_view(cloud: &GaussianCloud, camera: &ViewCamera, gaussians: &[u32]) -> bool {
+        let projection = Projection::new(cloud, camera);
+        gaussians.iter().any(|gaussian| projection.of(*gaussian).is_some())
     }
 
     /// Number of blocks.
@@ -84,29 +92,54 @@ impl Coverage {
     }
 }
 
-/// The Gaussians in view, front to back.
-fn seen(cloud: &GaussianCloud, camera: &ViewCamera, (columns, rows): (u32, u32)) -> Vec<Seen> {
-    let (axes, translation) = camera.rows();
-    let pinhole = &camera.pinhole;
-    // Pixel centres are whole numbers; the first block begins half a pixel before the first centre.
-    let in_blocks = |pixel: f32| (pixel + 0.5) / BLOCK as f32;
-    let project = |i: usize| {
-        let along = |axis: usize| axes[axis].dot(cloud.means[i]) + translation[axis];
+/// A camera's projection into blocks.
+struct Projection<'a> {
+    cloud: &'a GaussianCloud,
+    axes: [Vec3; 3],
+    translation: [f32; 3],
+    pinhole: Pinhole,
+    columns: f32,
+    rows: f32,
+}
+
+impl<'a> Projection<'a> {
+    fn new(cloud: &'a GaussianCloud, camera: &ViewCamera) -> Self {
+        let (pinhole, (axes, translation)) = (camera.pinhole, camera.rows());
+        let [columns, rows] = size(&pinhole).map(|blocks| blocks as f32);
+        Self { cloud, axes, translation, pinhole, columns, rows }
+    }
+
+    /// A Gaussian, if it is in view.
+    fn of(&self, gaussian: u32) -> Option<Seen> {
+        let (i, cloud, pinhole) = (gaussian as usize, self.cloud, &self.pinhole);
+        let along = |axis: usize| self.axes[axis].dot(cloud.means[i]) + self.translation[axis];
         let depth = along(2);
         if !(depth > NEAR_METRES as f32 && depth.is_finite()) {
             return None;
         }
+        // Pixel centres are whole numbers; the first block begins half a pixel before the first centre.
+        let in_blocks = |pixel: f32| (pixel + 0.5) / BLOCK as f32;
         let x = in_blocks(pinhole.fx as f32 * along(0) / depth + pinhole.cx as f32);
         let y = in_blocks(pinhole.fy as f32 * along(1) / depth + pinhole.cy as f32);
         let log_scale = cloud.log_scales[i];
         let size = (0.5 * (log_scale.element_sum() - log_scale.min_element())).exp();
         let deviation = size * pinhole.fx as f32 / depth / BLOCK as f32;
         let radius = EXTENT * (deviation * deviation + BLOCK_VARIANCE).sqrt();
-        let inside = x + radius > 0.0 && y + radius > 0.0 && x - radius < columns as f32 && y - radius < rows as f32;
-        let opacity = opacity_from_raw(cloud.raw_opacities[i]);
-        inside.then_some(Seen { gaussian: i as u32, depth, x, y, variance: deviation * deviation, opacity })
-    };
-    let mut seen: Vec<Seen> = (0..cloud.len()).filter_map(project).collect();
+        let inside = x + radius > 0.0 && y + radius > 0.0 && x - radius < self.columns && y - radius < self.rows;
+        let opacity = || opacity_from_raw(cloud.raw_opacities[i]);
+        inside.then(|| Seen { gaussian, depth, x, y, variance: deviation * deviation, opacity: opacity() })
+    }
+}
+
+/// Columns and rows of blocks in an image.
+fn size(pinhole: &Pinhole) -> [u32; 2] {
+    [pinhole.width, pinhole.height].map(|side| side.div_ceil(BLOCK))
+}
+
+/// The Gaussians in view, front to back.
+fn seen(cloud: &GaussianCloud, camera: &ViewCamera) -> Vec<Seen> {
+    let projection = Projection::new(cloud, camera);
+    let mut seen: Vec<Seen> = (0..cloud.len() as u32).filter_map(|gaussian| projection.of(gaussian)).collect();
     seen.sort_unstable_by(|a, b| a.depth.total_cmp(&b.depth).then(a.gaussian.cmp(&b.gaussian)));
     seen
 }
@@ -120,10 +153,10 @@ fn blocks((x, y): (f32, f32), radius: f32, (columns, rows): (u32, u32)) -> impl 
 
 #[cfg(test)]
 mod tests {
-    use glam::{Quat, Vec3};
+    use glam::Quat;
 
     use super::*;
-    use crate::geometry::{Pinhole, Se3};
+    use crate::geometry::Se3;
     use crate::splat::{Gaussian, ShDegree};
 
     fn camera() -> ViewCamera {

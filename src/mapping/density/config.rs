@@ -119,7 +119,7 @@ impl Default for MultiViewConfig {
             max_growth: 0.015,
             min_age: 2,
             min_weight: 0.02,
-            min_contribution: 1.5,
+            min_contribution: 1.25,
             faint_opacity: 0.1,
         }
     }

@@ -22,11 +22,15 @@ const VERDICT: u32 = VERDICT_BITS & !(SEEN | FAINT);
 /// The change that verdicts on all Gaussians lead to, `[N]`. At most `most` are left, undivided ones first.
 pub(super) fn plan(verdicts: &[u32], most: usize, config: &DensityConfig) -> Plan {
     // Most Gaussians stay as they are.
-    let marked = (0..).zip(verdicts).filter(|(_, word)| **word & (VERDICT | FAINT) != 0);
-    let marked: Vec<(u32, u32)> = marked.map(|(i, word)| (i, *word)).collect();
+    let (mut marked, mut scored) = (Vec::new(), 0);
+    for (i, word) in (0u32..).zip(verdicts.iter().copied()) {
+        scored += usize::from(word & SEEN != 0);
+        if word & (VERDICT | FAINT) != 0 {
+            marked.push((i, word));
+        }
+    }
     let faint_limit = median_score_of_faint(&marked);
     let is_removed = |word: u32| word & VERDICT == VERDICT_REMOVE || (word & FAINT != 0 && score(word) > faint_limit);
-    let scored = verdicts.iter().filter(|word| **word & SEEN != 0).count();
     let chosen = chosen(&marked, scored, config);
     let mut chosen = chosen.iter().copied().peekable();
     let mut room = most.saturating_sub(verdicts.len());

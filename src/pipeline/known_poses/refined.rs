@@ -80,20 +80,26 @@ impl Refined {
     fn within(self, region: &Region, recording: &Recording) -> Result<Self, PipelineError> {
         let cloud = &*self.map.cloud;
         let places: Vec<Place> = cloud.means.iter().map(|mean| region.place(*mean)).collect();
+        let near: Vec<u32> =
+            (0..).zip(&places).filter(|(_, place)| **place != Place::Beyond).map(|(gaussian, _)| gaussian).collect();
         let keyframes: Vec<(usize, RefinedKeyframe)> = self.keyframes.into_iter().collect();
         let look = |(frame, keyframe): &(usize, RefinedKeyframe)| {
             let pinhole = recording.map_pinhole_of(*frame);
             let camera = ViewCamera { pinhole, camera_from_world: keyframe.world_from_camera.inverse() };
-            let coverage = Coverage::of(cloud, &camera);
-            let part = RegionView::of(&coverage, &places);
-            (pinhole, coverage, part)
+            // In a large scene, most cameras look elsewhere.
+            Coverage::any_in_view(cloud, &camera, &near).then(|| {
+                let coverage = Coverage::of(cloud, &camera);
+                let part = RegionView::of(&coverage, &places);
+                (pinhole, coverage, part)
+            })
         };
         let (mut is_context, mut supervision) = (vec![false; cloud.len()], vec![Supervision::default(); cloud.len()]);
         let mut chosen = BTreeMap::new();
         // Sums in the order of the keyframes, a few of which are held at a time.
         for keyframes in keyframes.chunks(AT_ONCE) {
             let seen: Vec<_> = keyframes.par_iter().map(look).collect();
-            for ((frame, keyframe), (pinhole, coverage, part)) in keyframes.iter().zip(seen) {
+            for ((frame, keyframe), seen) in keyframes.iter().zip(seen) {
+                let Some((pinhole, coverage, part)) = seen else { continue };
                 for (block, gaussian, share) in &coverage.shares {
                     let here = part.as_ref().is_some_and(|part| part.valid[*block as usize]);
                     supervision[*gaussian as usize].add(*share, here);
