@@ -39,10 +39,13 @@ fn divide(inside: Vec<Vec3>, part: &Part, limits: (f32, usize), found: &mut impl
     };
     let Some((axis, at)) = border else { return found(part.space.0, part.space.1) };
     let (below, above): (Vec<Vec3>, Vec<Vec3>) = inside.into_iter().partition(|mean| mean[axis] < at);
-    let clipped = |(mut low, mut high): (Vec3, Vec3), is_below: bool| {
-        let end = if is_below { &mut high } else { &mut low };
-        end[axis] = at;
-        (low.min(high), high)
+    // A box beyond the border ends at it.
+    let clipped = |corners: (Vec3, Vec3), is_below: bool| {
+        let clip = |mut corner: Vec3| {
+            corner[axis] = if is_below { corner[axis].min(at) } else { corner[axis].max(at) };
+            corner
+        };
+        (clip(corners.0), clip(corners.1))
     };
     for (inside, is_below) in [(below, true), (above, false)] {
         let part = Part { cameras: clipped(part.cameras, is_below), space: clipped(part.space, is_below) };
