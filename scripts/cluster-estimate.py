@@ -54,7 +54,7 @@ def scene_table(step_s, visits_per_border, see_s, cores, storage, image, gaussia
     read = KEYFRAMES * image / storage
     work = KEYFRAMES * EPOCHS * step_s
     whole = start_s + read + work
-    # The plan reads the recording and finds what each cell's keyframes are; the merge reads the results and the map, and writes one.
+    # The plan reads the recording and finds each cell's keyframes; the merge reads the results and the map, and writes one.
     serial = read + see + 3 * GAUSSIANS * gaussian / storage
     print(
         f"{KEYFRAMES:,} keyframes at 1920x1080, {GAUSSIANS:,} Gaussians, {EPOCHS} epochs, {cells} cells; {visits:.2f} visits to a "

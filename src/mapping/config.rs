@@ -236,7 +236,7 @@ impl MappingConfig {
         (*max_growth, *pixel_gradient, *min_contribution) = (0.15, 1.25, 0.5);
         // Photos arrive before there is a map to compare them with.
         let exposure = ExposureConfig { refinements: 3, ..ExposureConfig::default() };
-        // As the settings around it were chosen.
+        // The degree with which the other settings were chosen.
         let sh_degree = ShDegree::new(2).expect("degrees 0 to 3 exist");
         Self { sh_degree, iterations_per_keyframe: 0, first_iterations: 0, exposure, refine, adam, density, ..Self::default() }
     }

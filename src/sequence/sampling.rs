@@ -4,15 +4,17 @@ use super::DepthImage;
 
 /// Depths further apart than this share (of the nearest) lie on different surfaces and are not averaged.
 const SAME_SURFACE: f32 = 0.03;
-/// Nearest pixel of a position outside of the image.
+/// The nearest pixel of a position outside of the image.
 const OUTSIDE: u32 = u32::MAX;
 
-/// A position: the pixel to its upper left, and how far beyond it lies. Pixels are numbered row by row.
+/// A position. Pixels are numbered row by row.
 #[derive(Clone, Copy, Debug)]
 struct Sample {
+    /// Pixel to its upper left, and how far beyond that it lies, pixels.
     corner: u32,
     right: f32,
     down: f32,
+    /// Nearest pixel, or [`OUTSIDE`].
     nearest: u32,
 }
 
@@ -22,7 +24,7 @@ pub(super) struct Sampler {
     samples: Vec<Sample>,
     group: usize,
     /// From a pixel to the next one in its row and in its column; 0 where there is only one.
-    steps: [usize; 2],
+    strides: [usize; 2],
 }
 
 impl Sampler {
@@ -41,14 +43,14 @@ impl Sampler {
             let nearest = if inside { y as u32 * width + x as u32 } else { OUTSIDE };
             Sample { corner: top * width + left, right, down, nearest }
         };
-        let steps = [usize::from(width > 1), if height > 1 { width as usize } else { 0 }];
-        Self { samples: positions.iter().map(sample).collect(), group, steps }
+        let strides = [usize::from(width > 1), if height > 1 { width as usize } else { 0 }];
+        Self { samples: positions.iter().map(sample).collect(), group, strides }
     }
 
     /// Mean of each group's bilinear samples, `C` interleaved channels a pixel.
     pub fn means<const C: usize>(&self, image: &[u8]) -> Vec<u8> {
         let mut means = Vec::with_capacity(self.samples.len() / self.group * C);
-        let [right, down] = self.steps.map(|step| step * C);
+        let [right, down] = self.strides.map(|stride| stride * C);
         for group in self.samples.chunks_exact(self.group) {
             let mut sum = [0.0f32; C];
             for Sample { corner, right: u, down: v, .. } in group {
