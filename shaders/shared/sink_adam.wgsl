@@ -23,6 +23,8 @@ struct AdamSetup {
     least_share: f32,
     // Gaussians before this place never move.
     frozen: u32,
+    // Weight of the squares of the higher harmonics in the loss summed over the pixels, halved.
+    harmonics_prior: f32,
 }
 
 // The share after n steps is 1/(1 + n/this), but the least at least.
@@ -106,7 +108,9 @@ fn store_gradient(plane: u32, i: u32, raw: vec4<f32>) {
     let at = plane * view.capacity + i;
     let correction = select(corrections, corrections_of_harmonics, plane > 3u);
     // A gradient that overflowed (or NaN) moves nothing.
-    let gradient = select(vec4(0.0), raw, abs(raw) < vec4(1e15));
+    let finite = select(vec4(0.0), raw, abs(raw) < vec4(1e15));
+    let prior = select(0.0, adam.harmonics_prior / f32(view.width * view.height), plane > 3u);
+    let gradient = finite + prior * parameters[at];
     let before = moments_1[at];
     let m = mix(gradient, before, adam.beta_1);
     let v = mix(gradient * gradient, moments_2[at], adam.beta_2);

@@ -16,6 +16,8 @@ use super::{Verbosity, print, progress};
 /// Frames that a calibration takes, where no range is given.
 pub const FRAMES: usize = 600;
 const AHEAD: usize = 8;
+/// Depth images of most sensors count millimetres.
+const USUAL_DEPTH_UNITS_PER_METRE: f64 = 1000.0;
 
 #[derive(Args)]
 pub struct CalibrateArgs {
@@ -36,6 +38,8 @@ pub struct CalibrateArgs {
 #[derive(Serialize)]
 struct CameraFile {
     fps: f64,
+    /// With depth images that nothing else describes.
+    depth_units_per_metre: Option<f64>,
     pinhole: Pinhole,
     distortion: Distortion,
 }
@@ -92,7 +96,12 @@ pub fn find_camera(
     let mut intervals: Vec<f64> = frames.windows(2).map(|pair| pair[1].timestamp_s() - pair[0].timestamp_s()).collect();
     intervals.sort_by(f64::total_cmp);
     let fps = intervals.get(intervals.len() / 2).filter(|s| **s > 0.0).map_or(30.0, |s| 1.0 / s);
-    let file = CameraFile { fps, pinhole: found.camera.pinhole, distortion: found.camera.distortion };
+    let has_depth = sequence.layout.name() == "images" && path.join("depth").is_dir();
+    if has_depth {
+        tracing::warn!("the depth images are taken to be in millimetres; depth_units_per_metre in {} changes that", out.display());
+    }
+    let depth_units_per_metre = has_depth.then_some(USUAL_DEPTH_UNITS_PER_METRE);
+    let file = CameraFile { fps, depth_units_per_metre, pinhole: found.camera.pinhole, distortion: found.camera.distortion };
     let comment = format!("# Found by keysplat calibrate: {}.\n", describe(&found));
     write_atomically(out, (comment + &toml::to_string(&file).into_diagnostic()?).as_bytes()).into_diagnostic()?;
     Ok(found)

@@ -28,7 +28,7 @@ pub struct MappingConfig {
     pub yields_to_keyframes: bool,
     /// Seed of the draws among keyframes.
     pub seed: u64,
-    /// Keyframes that a step may draw.
+    /// Keyframes that the steps over the window learn from.
     pub window: WindowConfig,
     /// Bounds on Gaussians, memory and keyframes.
     pub limits: LimitsConfig,
@@ -75,7 +75,7 @@ impl Default for MappingConfig {
     }
 }
 
-/// Which keyframes a step may draw.
+/// The keyframes that the steps over the window learn from.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct WindowConfig {
@@ -83,13 +83,11 @@ pub struct WindowConfig {
     pub recent: usize,
     /// Older keyframes that share most landmarks with the newest one.
     pub covisible: usize,
-    /// Share of steps that go to any older keyframe, so that the map does not forget.
-    pub older_share: f32,
 }
 
 impl Default for WindowConfig {
     fn default() -> Self {
-        Self { recent: 6, covisible: 3, older_share: 0.6 }
+        Self { recent: 6, covisible: 3 }
     }
 }
 
@@ -160,11 +158,11 @@ impl Default for PointsConfig {
     }
 }
 
-/// Consolidation: seeded, shuffled epochs over all keyframes with images, online and after the last keyframe.
+/// Consolidation: steps over all keyframes with images, online and, in seeded, shuffled epochs, after the last keyframe.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RefineConfig {
-    /// Steps of the running epoch that follow each keyframe.
+    /// Steps over all keyframes that follow each keyframe, most over those that had few.
     pub steps_per_keyframe: usize,
     /// Epochs after the last keyframe.
     pub final_epochs: usize,
@@ -205,8 +203,8 @@ impl RefineConfig {
 impl Default for RefineConfig {
     fn default() -> Self {
         Self {
-            steps_per_keyframe: 8,
-            final_epochs: 13,
+            steps_per_keyframe: 13,
+            final_epochs: 8,
             steps: 0,
             seconds: None,
             density_every: 200,
@@ -278,7 +276,6 @@ impl MappingConfig {
             );
         }
         let shares = [
-            ("window.older_share", self.window.older_share),
             ("insertion.min_alpha", s.min_alpha),
             ("insertion.opacity", s.opacity),
             ("insertion.detail", s.detail),

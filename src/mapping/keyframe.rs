@@ -87,6 +87,8 @@ pub(super) struct MappedKeyframe {
     scale_since_anchor: f64,
     /// Exposure of the recorded image against the map.
     pub exposure: Exposure,
+    /// Steps that learnt from it.
+    pub steps: u32,
     image: Images,
     /// On the host, where depth is swept for.
     gray: Option<GrayImage>,
@@ -104,6 +106,7 @@ pub(super) struct KeyframeState {
     anchored_from_world: Se3,
     scale_since_anchor: f64,
     exposure: Exposure,
+    steps: u32,
     covisible: Vec<KeyframeId>,
     is_resident: bool,
     /// Depth that was swept for, `[H, W]`: it depends on what the other poses were then. Nothing where the recording has it.
@@ -126,6 +129,7 @@ impl MappedKeyframe {
             anchored_from_world: camera.camera_from_world,
             scale_since_anchor: 1.0,
             exposure: Exposure::default(),
+            steps: 0,
             image: Images::new(gpu, image, with_half)?,
             gray: matches!(keyframe.depth_source, DepthSource::Landmarks { .. }).then(|| plane_sweep::gray(&image.color)),
             sight: Sight::of(image),
@@ -141,6 +145,7 @@ impl MappedKeyframe {
             anchored_from_world: self.anchored_from_world,
             scale_since_anchor: self.scale_since_anchor,
             exposure: self.exposure,
+            steps: self.steps,
             covisible: self.covisible.clone(),
             is_resident: self.is_resident(),
             swept: self.gray.is_some().then(swept).transpose()?,
@@ -171,6 +176,7 @@ impl MappedKeyframe {
             anchored_from_world: state.anchored_from_world,
             scale_since_anchor: state.scale_since_anchor,
             exposure: state.exposure,
+            steps: state.steps,
             gray: state.swept.as_ref().map(|_| plane_sweep::gray(&image.color)),
             image: images,
             sight: Sight::of(image),

@@ -95,7 +95,7 @@ pub struct Mapper {
     rng: Rng,
     step_times: Vec<Duration>,
     host_times: HostTimes,
-    /// Keyframes left of the running epoch of consolidation.
+    /// Keyframes left of the running epoch of the final refinement.
     epoch: Vec<usize>,
     /// Steps at the last density control.
     controlled_at: usize,
@@ -333,9 +333,7 @@ impl Mapper {
         let mut scoring = if controlled { self.scoring_steps(&window, density) } else { Vec::new() };
         scoring.truncate(iterations);
         let unscored = iterations - scoring.len();
-        let beyond = self.keyframes.len() > window.len();
-        let older = self.learnable(0..if beyond { self.keyframes.len().saturating_sub(config.window.recent) } else { 0 });
-        let mut before = schedule::steps(&window, &older, unscored, &mut self.rng, &config.window);
+        let mut before: Vec<Step> = window.iter().cycle().take(unscored).map(|k| Step::new(*k)).collect();
         let mut after = before.split_off((density.after_share * unscored as f32).round() as usize);
         // Together where they are one batch: the host waits once.
         if !controlled {
@@ -353,7 +351,7 @@ impl Mapper {
             (pruned, grown) = self.timed("density", |mapper| mapper.control_density(scored.1, density))?;
             self.controlled_at = self.step_times.len();
         }
-        let rest = self.with_consolidation(after)?;
+        let rest = self.with_consolidation(after);
         taken += self.take(&rest, &config.adam, interlude)?;
         if config.yields_to_keyframes {
             taken += self.consolidate_until(interlude)?;

@@ -38,11 +38,49 @@ pub(super) fn window(keyframes: &[MappedKeyframe], config: &WindowConfig) -> Vec
     window
 }
 
-/// So many steps over the window, newest first; now and then one over any of the `older` keyframes, so that the map does not forget.
-pub(super) fn steps(window: &[usize], older: &[usize], count: usize, rng: &mut Rng, config: &WindowConfig) -> Vec<Step> {
-    let draw = |taken: usize| {
-        let goes_back = !older.is_empty() && rng.f32() < config.older_share;
-        Step::new(if goes_back { older[rng.usize(..older.len())] } else { window[taken % window.len()] })
+/// So many of these keyframes, drawn one by one, each with a probability inversely proportional to one more than the steps `taken` over it. None is
+/// drawn twice before all are drawn.
+pub(super) fn draw_least_learnt(keyframes: &[usize], taken: impl Fn(usize) -> u32, count: usize, rng: &mut Rng) -> Vec<usize> {
+    let mut left: Vec<(usize, f64)> = Vec::new();
+    let mut draw = || {
+        if left.is_empty() {
+            left = keyframes.iter().map(|&k| (k, 1.0 / (1.0 + f64::from(taken(k))))).collect();
+        }
+        let mut at = rng.f64() * left.iter().map(|(_, weight)| weight).sum::<f64>();
+        let drawn = left.iter().position(|(_, weight)| {
+            at -= weight;
+            at < 0.0
+        });
+        let drawn = drawn.or(left.len().checked_sub(1))?;
+        Some(left.remove(drawn).0)
     };
-    (0..count).map(draw).collect()
+    (0..count).map_while(|_| draw()).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn draws_even_out_the_steps_and_repeat_none_too_soon() {
+        let mut rng = Rng::with_seed(3);
+        let keyframes = [4, 5, 6, 7, 8, 9];
+        let mut steps = [0, 0, 0, 0, 90, 40, 20, 10, 0, 0];
+        for _ in 0..30 {
+            let drawn = draw_least_learnt(&keyframes, |k| steps[k], 4, &mut rng);
+            assert!(drawn.len() == 4 && drawn.iter().enumerate().all(|(i, k)| k >= &4 && !drawn[..i].contains(k)), "{drawn:?}");
+            drawn.iter().for_each(|k| steps[*k] += 1);
+        }
+        // 120 steps in all: the unlearnt ones catch up, and the others are not forgotten.
+        assert!(steps[9] > 25 && steps[8] > 25 && (90..100).contains(&steps[4]) && steps[4..8].iter().sum::<u32>() > 160, "{steps:?}");
+    }
+
+    #[test]
+    fn more_steps_than_keyframes_are_several_rounds() {
+        let mut drawn = draw_least_learnt(&[2, 3], |_| 7, 5, &mut Rng::with_seed(1));
+        assert!(drawn[..2] != [2, 2] && drawn[..2] != [3, 3]);
+        drawn.sort_unstable();
+        assert!(drawn == [2, 2, 2, 3, 3] || drawn == [2, 2, 3, 3, 3]);
+        assert!(draw_least_learnt(&[], |_| 0, 3, &mut Rng::with_seed(1)).is_empty());
+    }
 }

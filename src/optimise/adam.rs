@@ -22,6 +22,9 @@ pub struct AdamConfig {
     pub lr_color: f32,
     /// Other harmonics' coefficients a step.
     pub lr_harmonics: f32,
+    /// Weight of ½ Σ (other harmonics' coefficient)² in the loss summed over the image's pixels: a Gaussian that shows little is seen alike from
+    /// all sides.
+    pub harmonics_prior: f32,
     /// The other harmonics move every n-th step only: they converge slowly, and are most of the parameters (FastGS: 16).
     pub harmonics_every: usize,
     /// Decay of the first and the second moments.
@@ -50,6 +53,7 @@ impl Default for AdamConfig {
             lr_rotation: 0.018,
             lr_color: 0.03,
             lr_harmonics: 0.015,
+            harmonics_prior: 0.01,
             harmonics_every: 1,
             beta_1: 0.8,
             beta_2: 0.999,
@@ -129,7 +133,7 @@ impl AdamConfig {
             color_settling: if self.color_settling_steps > 0.0 { 1.0 / self.color_settling_steps } else { 0.0 },
             least_share: 1.0 / self.ema_steps,
             frozen: frozen as u32,
-            pad: 0.0,
+            harmonics_prior: self.harmonics_prior,
         }
     }
 }

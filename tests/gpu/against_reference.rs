@@ -68,7 +68,7 @@ fn the_loss_and_its_whole_gradient_agree() {
 fn adam_steps_agree() {
     let Some(gpu) = adapter() else { return };
     let loss = LossConfig::default();
-    let adam = AdamConfig { harmonics_every: 1, color_settling_steps: 2.0, ema_steps: 1.5, ..AdamConfig::default() };
+    let adam = AdamConfig { harmonics_every: 1, color_settling_steps: 2.0, ema_steps: 1.5, harmonics_prior: 0.5, ..AdamConfig::default() };
     let mut rng = Rng::with_seed(11);
     let camera = crate::common::camera(&mut rng, 48, 32);
     let mut cloud = crate::common::scene(&mut rng, 60, ShDegree::ALL[1]);
@@ -93,7 +93,13 @@ fn adam_steps_agree() {
             rates.extend([f64::from(adam.lr_harmonics) * pace; 9]);
             let decay = Decay64 { beta_1: adam.beta_1.into(), beta_2: adam.beta_2.into(), epsilon: adam.epsilon.into() };
             let before = states[i].steps;
-            states[i].step(&mut expected[i], &gradient.flat(), &rates, decay);
+            let mut gradient = gradient.flat();
+            if gradient.iter().any(|g| *g != 0.0) {
+                let prior = f64::from(adam.harmonics_prior) / f64::from(camera.pinhole.width * camera.pinhole.height);
+                let harmonics = gradient.len() - 9;
+                gradient[harmonics..].iter_mut().zip(&expected[i][harmonics..]).for_each(|(g, value)| *g += prior * value);
+            }
+            states[i].step(&mut expected[i], &gradient, &rates, decay);
             if states[i].steps > before {
                 states[i].take_average(&expected[i], 1.0 / 1.5);
             }

@@ -2,7 +2,8 @@
 
 use std::path::Path;
 
-use crate::common::recording::{Finished, change_line, color_file, copy_of_recording, finish, keysplat, recording, truncate};
+use crate::common::recording::{Finished, change_line, color_file, copy_of_recording, finish, keysplat, recording, scratch, truncate};
+use crate::common::requirements::recorded;
 
 fn check(folder: &Path, more: &[&str]) -> Finished {
     let mut command = keysplat(["check".as_ref(), folder.as_os_str()]);
@@ -87,4 +88,24 @@ fn what_makes_a_run_useless_fails_the_check() {
         found.stdout
     );
     check(&folder, &["--sensor", "mono"]).succeeded();
+}
+
+#[test]
+fn a_folder_with_depth_and_a_found_camera_is_a_recording() {
+    let Some(kitchen) = recorded("redkitchen") else { return };
+    let folder = scratch().join("uncalibrated");
+    for kind in ["rgb", "depth"] {
+        let mut files: Vec<_> = std::fs::read_dir(kitchen.join(kind)).unwrap().map(|file| file.unwrap().path()).collect();
+        files.sort();
+        std::fs::create_dir_all(folder.join(kind)).unwrap();
+        files[..150].iter().for_each(|file| drop(std::fs::copy(file, folder.join(kind).join(file.file_name().unwrap())).unwrap()));
+    }
+    let camera = folder.join("camera.toml");
+    let paths = [folder.as_os_str(), "--layout".as_ref(), "images".as_ref(), "--out".as_ref(), camera.as_os_str()];
+    let mut command = keysplat(["calibrate".as_ref()]);
+    command.args(paths);
+    let said = finish(command).succeeded();
+    assert!(said.stderr.contains("millimetres"), "{}", said.stderr);
+    let checked = check(&folder, &[]).succeeded().stdout;
+    assert!(checked.contains("(images, rgbd)") && checked.contains("1000 units a metre"), "{checked}");
 }

@@ -1,7 +1,8 @@
-//! Consolidation: steps over all keyframes. Each epoch draws every keyframe once, in a seeded shuffle.
+//! Consolidation: steps over all keyframes.
 //!
-//! Online, some steps of the running epoch follow each keyframe, at constant rates. The final refinement follows the last keyframe: steps at
-//! half size first, then at full size, with density control in between; rates fall exponentially, as 3DGS has it for positions. Where a map
+//! Online, some follow each keyframe, at constant rates, most of them over keyframes that had few. The final refinement follows the last keyframe:
+//! epochs that draw every keyframe once, in a seeded shuffle, at half size first, then at full size, with density control in between; rates fall
+//! exponentially, as 3DGS has it for positions. Where a map
 //! of others began the run, they first rise in proportion to the steps (Ma & Yarats 2021): Adam's first steps have the full length whatever
 //! the gradient, which a map that is good already does not survive.
 
@@ -14,6 +15,7 @@ use crate::mapping::{DensityConfig, MappingError, RefineConfig};
 use crate::optimise::AdamConfig;
 use crate::splat::model::Dropout;
 
+use super::schedule;
 use super::steps::Taken;
 use super::{BATCH, Interlude, Mapper, Step};
 
@@ -104,15 +106,15 @@ impl FinalRefinement {
 }
 
 impl Mapper {
-    /// Steps, and the online steps of the running epoch that follow them.
-    pub(super) fn with_consolidation(&mut self, mut steps: Vec<Step>) -> Result<Vec<Step>, MappingError> {
+    /// Steps over the window, and the online steps over all keyframes that follow them.
+    pub(super) fn with_consolidation(&mut self, mut steps: Vec<Step>) -> Vec<Step> {
         if !self.config.yields_to_keyframes {
-            steps.extend(self.draw(self.config.refine.steps_per_keyframe, false)?);
+            steps.extend(self.draw_online(self.config.refine.steps_per_keyframe, &steps));
         }
-        Ok(steps)
+        steps
     }
 
-    /// Takes steps of the running epoch until `interlude` ends them.
+    /// Takes steps over all keyframes until `interlude` ends them.
     ///
     /// # Errors
     /// [`MappingError`] if a buffer does not fit or the device fails.
@@ -120,10 +122,21 @@ impl Mapper {
         let config = self.config.clone();
         let mut taken = Taken::default();
         while !self.cloud.is_empty() && interlude.between(self)?.is_continue() {
-            let batch = self.draw(self.batch(), false)?;
+            let batch = self.draw_online(self.batch(), &[]);
+            if batch.is_empty() {
+                break;
+            }
             taken += self.steps(&batch, &config.adam, None)?.0;
         }
         Ok(taken)
+    }
+
+    /// So many steps over all keyframes, most over those that had fewest, `planned` ones included.
+    fn draw_online(&mut self, count: usize, planned: &[Step]) -> Vec<Step> {
+        let learnable = self.learnable(0..self.keyframes.len());
+        let keyframes = &self.keyframes;
+        let taken = |k: usize| keyframes[k].steps + planned.iter().filter(|step| step.keyframe == k).count() as u32;
+        schedule::draw_least_learnt(&learnable, taken, count, &mut self.rng).into_iter().map(Step::new).collect()
     }
 
     /// So many steps of the running epoch.

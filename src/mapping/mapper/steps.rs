@@ -82,6 +82,7 @@ impl Mapper {
         let then = judge.as_ref().map(|judge| judge as &dyn OverScores);
         let (reports, verdicts) = self.trainer.steps_and_then(&self.cloud, &views, (&self.config.loss, adam), then)?;
         self.step_times.extend(std::iter::repeat_n(started.elapsed() / batch.len().max(1) as u32, batch.len()));
+        batch.iter().for_each(|step| self.keyframes[step.keyframe].steps += 1);
         let mut taken = Taken { steps: batch.len(), psnr_sum: 0.0 };
         for (step, report) in batch.iter().zip(&reports) {
             if !report.loss.total(&self.config.loss).is_finite() {

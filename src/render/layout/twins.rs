@@ -286,7 +286,7 @@ host_twins! {
         least_share: f32,
         /// Gaussians before this place never move.
         frozen: u32,
-        /// Unused.
-        pad: f32,
+        /// Weight of the squares of the higher harmonics in the loss summed over the pixels, halved.
+        harmonics_prior: f32,
     }
 }
