@@ -98,7 +98,10 @@ pub fn find_camera(
     let fps = intervals.get(intervals.len() / 2).filter(|s| **s > 0.0).map_or(30.0, |s| 1.0 / s);
     let has_depth = sequence.layout.name() == "images" && path.join("depth").is_dir();
     if has_depth {
-        tracing::warn!("the depth images are taken to be in millimetres; depth_units_per_metre in {} changes that", out.display());
+        tracing::warn!(
+            "the depth images are taken to be in millimetres; depth_units_per_metre in {} changes that",
+            out.display()
+        );
     }
     let depth_units_per_metre = has_depth.then_some(USUAL_DEPTH_UNITS_PER_METRE);
     let file = CameraFile { fps, depth_units_per_metre, pinhole: found.camera.pinhole, distortion: found.camera.distortion };

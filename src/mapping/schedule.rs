@@ -72,7 +72,10 @@ mod tests {
             drawn.iter().for_each(|k| steps[*k] += 1);
         }
         // 120 steps in all: the unlearnt ones catch up, and the others are not forgotten.
-        assert!(steps[9] > 25 && steps[8] > 25 && (90..100).contains(&steps[4]) && steps[4..8].iter().sum::<u32>() > 160, "{steps:?}");
+        assert!(
+            steps[9] > 25 && steps[8] > 25 && (90..100).contains(&steps[4]) && steps[4..8].iter().sum::<u32>() > 160,
+            "{steps:?}"
+        );
     }
 
     #[test]

@@ -75,6 +75,9 @@ impl AdamConfig {
         if rates.iter().any(|rate| !(rate.is_finite() && *rate >= 0.0)) {
             return Err("every Adam rate must be finite and not negative".into());
         }
+        if !(self.harmonics_prior.is_finite() && self.harmonics_prior >= 0.0) {
+            return Err("harmonics_prior must be finite and not negative".into());
+        }
         if self.harmonics_every == 0 {
             return Err("harmonics_every must be at least 1".into());
         }

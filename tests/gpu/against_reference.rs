@@ -68,7 +68,13 @@ fn the_loss_and_its_whole_gradient_agree() {
 fn adam_steps_agree() {
     let Some(gpu) = adapter() else { return };
     let loss = LossConfig::default();
-    let adam = AdamConfig { harmonics_every: 1, color_settling_steps: 2.0, ema_steps: 1.5, harmonics_prior: 0.5, ..AdamConfig::default() };
+    let adam = AdamConfig {
+        harmonics_every: 1,
+        color_settling_steps: 2.0,
+        ema_steps: 1.5,
+        harmonics_prior: 0.5,
+        ..AdamConfig::default()
+    };
     let mut rng = Rng::with_seed(11);
     let camera = crate::common::camera(&mut rng, 48, 32);
     let mut cloud = crate::common::scene(&mut rng, 60, ShDegree::ALL[1]);

@@ -2,7 +2,9 @@
 
 use std::path::Path;
 
-use crate::common::recording::{Finished, change_line, color_file, copy_of_recording, finish, keysplat, recording, scratch, truncate};
+use crate::common::recording::{
+    Finished, change_line, color_file, copy_of_recording, finish, keysplat, recording, scratch, truncate,
+};
 use crate::common::requirements::recorded;
 
 fn check(folder: &Path, more: &[&str]) -> Finished {
@@ -98,12 +100,13 @@ fn a_folder_with_depth_and_a_found_camera_is_a_recording() {
         let mut files: Vec<_> = std::fs::read_dir(kitchen.join(kind)).unwrap().map(|file| file.unwrap().path()).collect();
         files.sort();
         std::fs::create_dir_all(folder.join(kind)).unwrap();
-        files[..150].iter().for_each(|file| drop(std::fs::copy(file, folder.join(kind).join(file.file_name().unwrap())).unwrap()));
+        for file in &files[..150] {
+            std::fs::copy(file, folder.join(kind).join(file.file_name().unwrap())).unwrap();
+        }
     }
     let camera = folder.join("camera.toml");
-    let paths = [folder.as_os_str(), "--layout".as_ref(), "images".as_ref(), "--out".as_ref(), camera.as_os_str()];
-    let mut command = keysplat(["calibrate".as_ref()]);
-    command.args(paths);
+    let mut command = keysplat(["calibrate"]);
+    command.arg(&folder).args(["--layout", "images", "--out"]).arg(&camera);
     let said = finish(command).succeeded();
     assert!(said.stderr.contains("millimetres"), "{}", said.stderr);
     let checked = check(&folder, &[]).succeeded().stdout;
