@@ -45,8 +45,10 @@ use crate::splat::{Exposure, GaussianCloud, ViewCamera};
 
 /// Gaussians that there is room for at first; the map's buffers grow with it.
 const FIRST_CAPACITY: usize = 4096;
-/// Steps submitted at once: the GPU never waits for the host between them, and a stop is heeded between batches.
+/// Steps of the final refinement submitted at once: the GPU never waits for the host between them, and a stop is heeded between batches.
 const BATCH: usize = 10;
+/// The same of the steps that follow a keyframe: those over all keyframes are one batch.
+const KEYFRAME_BATCH: usize = 16;
 /// Fewer where others wait for the machine.
 const YIELDING_BATCH: usize = 3;
 

@@ -22,7 +22,7 @@ pub struct AdamConfig {
     pub lr_color: f32,
     /// Other harmonics' coefficients a step.
     pub lr_harmonics: f32,
-    /// Weight of ½ Σ (other harmonics' coefficient)² in the loss summed over the image's pixels: a Gaussian that shows little is seen alike from
+    /// Weight of ½ Σ (other harmonics' coefficient)² in the loss summed over the image's pixels: a Gaussian that shows little looks alike from
     /// all sides.
     pub harmonics_prior: f32,
     /// The other harmonics move every n-th step only: they converge slowly, and are most of the parameters (FastGS: 16).

@@ -93,7 +93,7 @@ pub struct Trainer {
 }
 
 /// Most steps of a submission: their uniforms fit.
-const STEPS_AT_ONCE: usize = 12;
+const STEPS_AT_ONCE: usize = 16;
 /// Bytes between two logs: the least alignment of their bindings that every adapter has.
 const LOG_STRIDE: usize = 256;
 

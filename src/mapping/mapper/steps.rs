@@ -3,7 +3,7 @@
 use std::borrow::Cow;
 use std::time::Instant;
 
-use super::{BATCH, Interlude, Mapper, Step, YIELDING_BATCH};
+use super::{Interlude, KEYFRAME_BATCH, Mapper, Step, YIELDING_BATCH};
 use crate::mapping::chunks::Hidden;
 use crate::mapping::image_store::ImageStore;
 use crate::mapping::keyframe::MappedKeyframe;
@@ -42,9 +42,9 @@ impl Mapper {
         Ok((taken, verdicts))
     }
 
-    /// Steps submitted at once.
+    /// Steps after a keyframe that are submitted at once.
     pub(super) fn batch(&self) -> usize {
-        if self.config.yields_to_keyframes { YIELDING_BATCH } else { BATCH }
+        if self.config.yields_to_keyframes { YIELDING_BATCH } else { KEYFRAME_BATCH }
     }
 
     /// Takes a batch of steps; returns with them the verdicts of density control, if wanted.
