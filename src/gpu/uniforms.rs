@@ -7,7 +7,7 @@ use super::{Gpu, GpuBuffer, GpuError};
 /// Bytes between two uniforms: the least alignment of their bindings that every adapter has.
 const CELL_BYTES: usize = 256;
 /// Uniforms that a submission may have.
-const CELLS: usize = 64;
+const CELLS: usize = 96;
 
 /// A uniform of the present submission.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
