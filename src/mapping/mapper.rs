@@ -47,7 +47,7 @@ use crate::splat::{Exposure, GaussianCloud, ViewCamera};
 const FIRST_CAPACITY: usize = 4096;
 /// Steps of the final refinement submitted at once: the GPU never waits for the host between them, and a stop is heeded between batches.
 const BATCH: usize = 10;
-/// The same of the steps that follow a keyframe: those over all keyframes are one batch.
+/// The same of the steps that follow a keyframe. By default those after density control are one submission, and one wait.
 const KEYFRAME_BATCH: usize = 16;
 /// Fewer where others wait for the machine.
 const YIELDING_BATCH: usize = 3;

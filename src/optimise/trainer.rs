@@ -92,7 +92,7 @@ pub struct Trainer {
     logs: Vec<GpuBuffer>,
 }
 
-/// Most steps of a submission: their uniforms fit.
+/// Most steps of a submission: their uniforms fit, five a step at most.
 const STEPS_AT_ONCE: usize = 16;
 /// Bytes between two logs: the least alignment of their bindings that every adapter has.
 const LOG_STRIDE: usize = 256;

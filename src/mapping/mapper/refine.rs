@@ -139,7 +139,7 @@ impl Mapper {
     }
 
     /// So many steps of the running epoch.
-    fn draw(&mut self, count: usize, coarse: bool) -> Result<Vec<Step>, MappingError> {
+    fn draw_from_epoch(&mut self, count: usize, coarse: bool) -> Result<Vec<Step>, MappingError> {
         let mut steps = Vec::with_capacity(count);
         while steps.len() < count {
             if self.epoch.is_empty() {
@@ -222,7 +222,7 @@ impl Mapper {
         let end = refinement.done + density_every.min(left);
         while refinement.done < end && !refinement.is_done() && refinement.interlude(self, interlude)?.is_continue() {
             let coarse = refinement.progress() < half_size_share;
-            let mut batch = self.draw(BATCH.min(end - refinement.done), coarse)?;
+            let mut batch = self.draw_from_epoch(BATCH.min(end - refinement.done), coarse)?;
             if batch.is_empty() {
                 refinement.end_here();
                 break;
