@@ -42,7 +42,7 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_i
         flags |= FAINT;
         score = seen.y;
     } else if verdict == VERDICT_KEEP && is_old && is_seen && seen.x > setup.error_pixels * views
-        && by_view.y > setup.absolute_gradient * views && log_pixels > setup.split_log_pixels {
+        && by_view.y > setup.pixel_gradient * views && log_pixels > setup.split_log_pixels {
         verdict = VERDICT_SPLIT;
         score = seen.x / views;
     }

@@ -15,7 +15,7 @@ struct DensitySetup {
     min_contribution: f32,
     faint_raw_opacity: f32,
     error_pixels: f32,
-    absolute_gradient: f32,
+    pixel_gradient: f32,
     split_log_pixels: f32,
     // 3DGS, beyond all values where another strategy rules: see `ClassicConfig`.
     gradient: f32,

@@ -31,7 +31,7 @@ fn setup(cloud: &GpuCloud, (min_age, gradient): (f32, f32)) -> DensitySetup {
         min_contribution: 1.5,
         faint_raw_opacity: -1.0,
         error_pixels: 3.0,
-        absolute_gradient: 0.3,
+        pixel_gradient: 0.3,
         split_log_pixels: 2.0,
         gradient,
         split_or_clone_log_pixels: 2.5,

@@ -155,7 +155,7 @@ impl DensityConfig {
             min_contribution: v.min_contribution,
             faint_raw_opacity: raw_opacity_from_opacity(v.faint_opacity).max(f32::MIN),
             error_pixels: v.error_pixels,
-            absolute_gradient: v.pixel_gradient,
+            pixel_gradient: v.pixel_gradient,
             split_log_pixels: v.split_pixels.ln(),
             gradient: rules(DensityStrategy::Classic, c.gradient),
             split_or_clone_log_pixels: c.split_pixels.ln(),

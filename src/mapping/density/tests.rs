@@ -59,7 +59,7 @@ fn the_rules_are_those_of_the_configuration() {
     assert!(setup.min_raw_opacity.is_finite(), "an infinity is no uniform");
     let MultiViewConfig { min_weight, min_contribution, error_pixels, pixel_gradient, .. } = config.multi_view;
     assert_eq!([setup.min_weight, setup.min_contribution], [min_weight, min_contribution]);
-    assert_eq!([setup.error_pixels, setup.absolute_gradient], [error_pixels, pixel_gradient]);
+    assert_eq!([setup.error_pixels, setup.pixel_gradient], [error_pixels, pixel_gradient]);
     assert_eq!(config.without_growth().setup(&MapSize { count: 7, capacity: 256, rounds: 3 }).gradient, f32::MAX);
 }
 

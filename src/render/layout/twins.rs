@@ -201,7 +201,7 @@ host_twins! {
         /// Error pixels a view above which a Gaussian is too coarse,
         error_pixels: f32,
         /// with more absolute gradient a view than this, normalised device coordinates,
-        absolute_gradient: f32,
+        pixel_gradient: f32,
         /// and a longest axis beyond so many pixels: their natural logarithm.
         split_log_pixels: f32,
         /// Gradient a view from which 3DGS divides a Gaussian, normalised device coordinates.

@@ -34,7 +34,7 @@ pub fn verdict(setup: &DensitySetup, gaussian: &Gaussian, score: &GaussianScore,
     let is_coarse = is_old
         && is_seen
         && score.error_pixels / score.views > setup.error_pixels
-        && score.absolute_gradient / score.views > setup.absolute_gradient
+        && score.absolute_gradient / score.views > setup.pixel_gradient
         && log_pixels > setup.split_log_pixels;
     let is_valid = gaussian.mean.is_finite()
         && gaussian.raw_opacity.is_finite()
