@@ -19,6 +19,8 @@ struct AdamSetup {
     log_thickness: f32,
     // Inverse of the number of steps with whose root the steps of colours shrink; 0: they don't.
     color_settling: f32,
+    // The same of all other parameters.
+    geometry_settling: f32,
     // Least share that the present parameters have in their averages.
     least_share: f32,
     // Gaussians before this place never move.
@@ -41,8 +43,8 @@ const AVERAGED_PART: f32 = 4.0;
 // Bias corrections 1/(1 - βⁿ) of the first and the second moments after this step: of all planes, and of the higher harmonics.
 var<private> corrections: vec2<f32>;
 var<private> corrections_of_harmonics: vec2<f32>;
-// Share of their rates that the colours still take.
-var<private> color_pace: f32;
+// Shares of their rates that the geometry and the colours still take.
+var<private> paces: vec2<f32>;
 // Share of the present parameters in their averages, 0 to 1.
 var<private> share: f32;
 // Geometric mean of the standard deviations, metres.
@@ -62,7 +64,7 @@ fn begin_gradient(i: u32, interval: f32) {
     let log_scale = parameters[view.capacity + i];
     size = min(exp((log_scale.x + log_scale.y + log_scale.z) / 3.0), 1e3);
     corrections = count_step(view.capacity + i);
-    color_pace = inverseSqrt(1.0 + moments_1[view.capacity + i].w * adam.color_settling);
+    paces = inverseSqrt(1.0 + moments_1[view.capacity + i].w * vec2(adam.geometry_settling, adam.color_settling));
     share = max(1.0 / (1.0 + averages[3u * view.capacity + i].w / AVERAGED_PART), adam.least_share);
     if wants_harmonics() {
         corrections_of_harmonics = count_step(3u * view.capacity + i);
@@ -115,7 +117,7 @@ fn store_gradient(plane: u32, i: u32, raw: vec4<f32>) {
     let m = mix(gradient, before, adam.beta_1);
     let v = mix(gradient * gradient, moments_2[at], adam.beta_2);
     let unit = select(vec4(1.0), vec4(size, size, size, 1.0), plane == 0u);
-    let rate = adam.rates[min(plane, 4u)] * unit * correction.x * select(color_pace, 1.0, plane < 3u);
+    let rate = adam.rates[min(plane, 4u)] * unit * correction.x * select(paces.y, paces.x, plane < 3u);
     let moved = parameters[at] - rate * m / (sqrt(v * correction.y) + adam.epsilon);
     let now = select(moved, flatten(parameters[at], blunt(moved)), plane == 1u);
     parameters[at] = now;

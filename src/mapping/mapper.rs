@@ -328,7 +328,7 @@ impl Mapper {
             return Ok(KeyframeReport::default());
         }
         let config = self.config.clone();
-        let density = &config.density;
+        let (density, adam) = (&config.density, config.adam.online());
         // Where an adapter takes hundreds of steps before the next keyframe, a few more for density control delay nothing.
         let is_fast = config.yields_to_keyframes && self.step_times.len() - self.controlled_at >= config.refine.density_every;
         let controlled = is_fast || self.keyframes.len().is_multiple_of(density.every);
@@ -343,18 +343,18 @@ impl Mapper {
         } else if before.len() + scoring.len() <= self.batch() {
             scoring.splice(..0, before.drain(..));
         }
-        let mut taken = self.take(&before, &config.adam, interlude)?;
+        let mut taken = self.take(&before, &adam, interlude)?;
         self.cloud.begin_round();
         let (mut pruned, mut grown) = (0, 0);
         if controlled {
             self.trainer.begin_scores(&self.cloud)?;
-            let scored = self.take_scored(&scoring, &config.adam, density)?;
+            let scored = self.take_scored(&scoring, &adam, density)?;
             taken += scored.0;
             (pruned, grown) = self.timed("density", |mapper| mapper.control_density(scored.1, density))?;
             self.controlled_at = self.step_times.len();
         }
         let rest = self.with_consolidation(after);
-        taken += self.take(&rest, &config.adam, interlude)?;
+        taken += self.take(&rest, &adam, interlude)?;
         if config.yields_to_keyframes {
             taken += self.consolidate_until(interlude)?;
         }

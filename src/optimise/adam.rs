@@ -38,6 +38,10 @@ pub struct AdamConfig {
     /// After n steps of a Gaussian its colours take 1/√(1 + n / this) of their rates: they find their place fast, and then the views'
     /// noise and exposures are averaged. 0: all of them always.
     pub color_settling_steps: f32,
+    /// The same for position, opacity, scale and rotation.
+    pub geometry_settling_steps: f32,
+    /// Both before the final refinement: what many views have taught, the newest ones leave. 0: the two above.
+    pub online_settling_steps: f32,
     /// The map is shown with each Gaussian's parameters averaged over about a quarter of its steps so far, but no more than about so many
     /// of its last ones (Polyak & Juditsky 1992): successive views pull to and fro, and in between is where they agree. The steps
     /// themselves go on from the parameters as they are, and stay quick. 1: the map is shown as it is.
@@ -60,6 +64,8 @@ impl Default for AdamConfig {
             epsilon: 1e-15,
             max_elongation: 8.0,
             color_settling_steps: 200.0,
+            geometry_settling_steps: 0.0,
+            online_settling_steps: 50.0,
             ema_steps: 10.0,
         }
     }
@@ -84,8 +90,11 @@ impl AdamConfig {
         if ![self.beta_1, self.beta_2].iter().all(|beta| (0.0..1.0).contains(beta)) || self.beta_1 == 0.0 || self.beta_2 == 0.0 {
             return Err("beta_1 and beta_2 must lie between 0 and 1, both excluded".into());
         }
-        if !(self.color_settling_steps.is_finite() && self.color_settling_steps >= 0.0) {
-            return Err("color_settling_steps must be finite and not negative".into());
+        let settling = [self.color_settling_steps, self.geometry_settling_steps, self.online_settling_steps];
+        if settling.iter().any(|steps| !(steps.is_finite() && *steps >= 0.0)) {
+            return Err(
+                "color_settling_steps, geometry_settling_steps and online_settling_steps must be finite and not negative".into(),
+            );
         }
         if !(self.ema_steps.is_finite() && self.ema_steps >= 1.0) {
             return Err("ema_steps must be at least 1".into());
@@ -111,10 +120,19 @@ impl AdamConfig {
         }
     }
 
+    /// The same for steps before the final refinement.
+    pub fn online(&self) -> Self {
+        match self.online_settling_steps {
+            0.0 => self.clone(),
+            steps => Self { color_settling_steps: steps, geometry_settling_steps: steps, ..self.clone() },
+        }
+    }
+
     /// The GPU's copy for step number `step` of the map. The shortest axis shrinks to the `thickness`, in units of the second; the first `frozen`
     /// Gaussians never move.
     pub(super) fn setup(&self, step: usize, thickness: Option<f32>, frozen: usize) -> AdamSetup {
         let p = self.lr_position;
+        let settling = |steps: f32| if steps > 0.0 { steps.recip() } else { 0.0 };
         let rates = [
             [p, p, p, self.lr_opacity],
             // Lanes that hold no parameter stand still.
@@ -133,10 +151,12 @@ impl AdamConfig {
             step_harmonics: u32::from(step.is_multiple_of(self.harmonics_every)),
             log_elongation: self.max_elongation.ln(),
             log_thickness: thickness.map_or(f32::MAX, f32::ln),
-            color_settling: if self.color_settling_steps > 0.0 { 1.0 / self.color_settling_steps } else { 0.0 },
+            color_settling: settling(self.color_settling_steps),
+            geometry_settling: settling(self.geometry_settling_steps),
             least_share: 1.0 / self.ema_steps,
             frozen: frozen as u32,
             harmonics_prior: self.harmonics_prior,
+            pad: [0; 3],
         }
     }
 }

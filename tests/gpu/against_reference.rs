@@ -71,6 +71,7 @@ fn adam_steps_agree() {
     let adam = AdamConfig {
         harmonics_every: 1,
         color_settling_steps: 2.0,
+        geometry_settling_steps: 3.0,
         ema_steps: 1.5,
         harmonics_prior: 0.5,
         ..AdamConfig::default()
@@ -90,11 +91,13 @@ fn adam_steps_agree() {
         let gradients = trainer.gradients(&on_gpu, &camera, &image, &loss).unwrap();
         for (i, gradient) in cloud64(&gradients.cloud).iter().enumerate() {
             let size = (expected[i][3..6].iter().sum::<f64>() / 3.0).exp();
+            let pace = |settling: f64| (1.0 + f64::from(states[i].steps + 1) / settling).sqrt().recip();
             let mut rates = vec![f64::from(adam.lr_position) * size; 3];
             rates.extend([f64::from(adam.lr_log_scale); 3]);
             rates.extend([f64::from(adam.lr_rotation); 4]);
             rates.push(f64::from(adam.lr_opacity));
-            let pace = (1.0 + f64::from(states[i].steps + 1) / 2.0).sqrt().recip();
+            rates.iter_mut().for_each(|rate| *rate *= pace(3.0));
+            let pace = pace(2.0);
             rates.extend([f64::from(adam.lr_color) * pace; 3]);
             rates.extend([f64::from(adam.lr_harmonics) * pace; 9]);
             let decay = Decay64 { beta_1: adam.beta_1.into(), beta_2: adam.beta_2.into(), epsilon: adam.epsilon.into() };

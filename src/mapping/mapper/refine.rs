@@ -118,14 +118,14 @@ impl Mapper {
     /// # Errors
     /// [`MappingError`] if a buffer does not fit or the device fails.
     pub(super) fn consolidate_until(&mut self, interlude: &dyn Interlude) -> Result<Taken, MappingError> {
-        let config = self.config.clone();
+        let adam = self.config.adam.online();
         let mut taken = Taken::default();
         while !self.cloud.is_empty() && interlude.between(self)?.is_continue() {
             let batch = self.draw_online(self.batch(), &[]);
             if batch.is_empty() {
                 break;
             }
-            taken += self.steps(&batch, &config.adam, None)?.0;
+            taken += self.steps(&batch, &adam, None)?.0;
         }
         Ok(taken)
     }

@@ -282,11 +282,15 @@ host_twins! {
         log_thickness: f32,
         /// The colour's learning rate is divided by √(1 + this · steps of the Gaussian).
         color_settling: f32,
+        /// The same of all other learning rates.
+        geometry_settling: f32,
         /// Least share of the newest parameters in their average.
         least_share: f32,
         /// Gaussians before this place never move.
         frozen: u32,
         /// Weight of the squares of the higher harmonics in the loss summed over the pixels, halved.
         harmonics_prior: f32,
+        /// Unused.
+        pad: [u32; 3],
     }
 }
