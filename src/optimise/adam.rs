@@ -65,7 +65,7 @@ impl Default for AdamConfig {
             max_elongation: 8.0,
             color_settling_steps: 200.0,
             geometry_settling_steps: 0.0,
-            online_settling_steps: 50.0,
+            online_settling_steps: 100.0,
             ema_steps: 10.0,
         }
     }
