@@ -40,7 +40,7 @@ pub struct AdamConfig {
     pub color_settling_steps: f32,
     /// The same for position, opacity, scale and rotation.
     pub geometry_settling_steps: f32,
-    /// Both before the final refinement: what many views have taught, the newest ones leave. 0: the two above.
+    /// Both before the final refinement, where new views must not undo what earlier ones taught. 0: the two above.
     pub online_settling_steps: f32,
     /// The map is shown with each Gaussian's parameters averaged over about a quarter of its steps so far, but no more than about so many
     /// of its last ones (Polyak & Juditsky 1992): successive views pull to and fro, and in between is where they agree. The steps
