@@ -1,7 +1,7 @@
 //! Consolidation: steps over all keyframes.
 //!
-//! Online, some follow each keyframe, at constant rates, most of them over keyframes that had few. The final refinement follows the last keyframe:
-//! epochs that draw every keyframe once, in a seeded shuffle, at half size first, then at full size, with density control in between; rates fall
+//! Online, some follow each keyframe, most of them over keyframes that had few; rates fall with each Gaussian's own steps. The final refinement
+//! follows the last keyframe: epochs that draw every keyframe once, in a seeded shuffle, at half size first, then at full size, with density control in between; rates fall
 //! exponentially, as 3DGS has it for positions. Where a map of others began the run, they first rise in proportion to the steps (Ma & Yarats 2021):
 //! Adam's first steps have the full length whatever the gradient, which a map that is good already does not survive.
 

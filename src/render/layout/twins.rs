@@ -200,7 +200,7 @@ host_twins! {
         faint_raw_opacity: f32,
         /// Error pixels a view above which a Gaussian is too coarse,
         error_pixels: f32,
-        /// with more absolute gradient a view than this, normalised device coordinates,
+        /// with more absolute gradient a view than this, for a pixel of motion,
         pixel_gradient: f32,
         /// and a longest axis beyond so many pixels: their natural logarithm.
         split_log_pixels: f32,
