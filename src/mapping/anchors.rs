@@ -1,21 +1,12 @@
-//! The keyframe that each Gaussian was inserted from, and whether steps move it: when a closed loop moves a keyframe, its Gaussians go with it.
+//! The keyframe that each Gaussian was inserted from, and whether steps move it: when a correction moves a keyframe, its Gaussians go with it.
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use glam::Vec3;
-use nalgebra::Point3;
 use serde::{Deserialize, Serialize};
 
 use super::KeyframeId;
-use crate::geometry::{Se3, Sim3};
-use crate::render::{Plan, RunMotion};
-
-/// A keyframe that has moved by less than each of these since its Gaussians did was only refined, and optimisation takes these along; a loop moves it
-/// further.
-const MIN_SHIFT_METRES: f64 = 0.01;
-const MIN_TURN_RAD: f64 = 0.5 * std::f64::consts::PI / 180.0;
-/// As far as [`MIN_SHIFT_METRES`] at the two metres of a room.
-const MIN_LOG_SCALE: f64 = 0.005;
+use crate::geometry::Sim3;
+use crate::render::{Motions, Plan};
 
 /// Keyframe of a Gaussian; the highest bit is set where no step moves the Gaussian.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -104,47 +95,25 @@ impl Anchors {
         (0..).zip(&self.0).filter(move |(_, anchor)| which(**anchor)).map(|(place, _)| place)
     }
 
-    /// The runs of Gaussians whose keyframe has moved, ascending. Those that steps move follow `motions`, beyond a refinement; the fixed ones, which
-    /// no step takes along, follow `each`.
-    pub fn moved(&self, motions: &BTreeMap<KeyframeId, Sim3>, each: &BTreeMap<KeyframeId, Sim3>) -> Vec<RunMotion> {
+    /// The Gaussians whose keyframe has moved, new_from_old each.
+    pub fn moved(&self, each: &BTreeMap<KeyframeId, Sim3>) -> Motions {
         let mut runs = Vec::new();
         let mut first = 0;
-        for run in self.0.chunk_by(|a, b| a == b) {
-            let keyframe = run[0].keyframe();
-            let motion = if run[0].is_fixed() { each } else { motions }.get(&keyframe);
-            let clears_moments = motions.contains_key(&keyframe);
-            runs.extend(motion.map(|motion| RunMotion { run: first..first + run.len(), new_from_old: *motion, clears_moments }));
+        let places: BTreeMap<KeyframeId, usize> = each.keys().copied().zip(0..).collect();
+        for run in self.0.chunk_by(|a, b| a.keyframe() == b.keyframe()) {
+            let motion = places.get(&run[0].keyframe());
+            runs.extend(motion.map(|motion| (first..first + run.len(), *motion)));
             first += run.len();
         }
-        runs
+        Motions { of: each.values().copied().collect(), runs }
     }
-}
-
-/// new_from_old, how a world moves that is held by a camera, when distances from the camera grow by a factor; `None` if that is no more
-/// than a refinement.
-pub(super) fn motion(old_world_from_camera: &Se3, new_world_from_camera: &Se3, scale: f64) -> Option<Sim3> {
-    let old_from_new = old_world_from_camera.inverse() * new_world_from_camera;
-    let far = is_beyond_refinement(old_from_new.translation.vector.norm(), old_from_new.rotation.angle(), scale);
-    let world_from_old_camera = Sim3 { scale, ..Sim3::from(*new_world_from_camera) };
-    far.then(|| world_from_old_camera * Sim3::from(*old_world_from_camera).inverse())
-}
-
-/// Whether a motion is more than a refinement of what is around a point of the new world: then moments belong to where the Gaussians were.
-pub(super) fn is_far(new_from_old: &Sim3, point: Vec3) -> bool {
-    let point = Point3::new(point.x, point.y, point.z).cast();
-    let shift = new_from_old.inverse().act(&point) - point;
-    is_beyond_refinement(shift.norm(), new_from_old.rotation.angle(), new_from_old.scale)
-}
-
-fn is_beyond_refinement(shift_metres: f64, turn_rad: f64, scale: f64) -> bool {
-    shift_metres > MIN_SHIFT_METRES || turn_rad > MIN_TURN_RAD || scale.ln().abs() > MIN_LOG_SCALE
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::geometry::Se3;
     use crate::render::Division;
-    use nalgebra::Vector3;
 
     #[test]
     fn runs_follow_appending_pruning_and_growing() {
@@ -154,43 +123,17 @@ mod tests {
         anchors.apply(&Plan { removed: vec![1, 2, 5, 7], divided });
         let keyframes = |anchors: &Anchors| anchors.at(&(0..anchors.len() as u32).collect::<Vec<_>>());
         assert_eq!(keyframes(&anchors), [0, 0, 2, 2, 5, 0, 0, 2, 2]);
-        let new_from_old = Sim3::from(Se3::translation(1.0, 0.0, 0.0));
-        let motions = [2, 5, 7].map(|keyframe| (keyframe, new_from_old)).into();
-        let none = BTreeMap::new();
-        let run = |clears_moments| move |run| RunMotion { run, new_from_old, clears_moments };
-        assert_eq!(anchors.moved(&motions, &none), [2..4, 4..5, 7..9].map(run(true)));
-        assert!(anchors.moved(&none, &motions).is_empty());
+        let by = |metres: f64| Sim3::from(Se3::translation(metres, 0.0, 0.0));
+        let each = [(2, by(1.0)), (5, by(2.0)), (7, by(3.0))].into();
+        let moved = Motions { of: vec![by(1.0), by(2.0), by(3.0)], runs: vec![(2..4, 0), (4..5, 1), (7..9, 0)] };
+        assert_eq!((anchors.moved(&each), moved.gaussians()), (moved, 5));
+        assert!(anchors.moved(&BTreeMap::new()).runs.is_empty());
         anchors.fix(&[3, 8]);
-        assert_eq!(anchors.moved(&motions, &none), [2..3, 4..5, 7..8].map(run(true)));
-        assert_eq!(anchors.moved(&none, &motions), [3..4, 8..9].map(run(false)));
-        assert_eq!(anchors.moved(&motions, &motions), [2..3, 3..4, 4..5, 7..8, 8..9].map(run(true)));
+        assert_eq!(anchors.moved(&each).runs, [(2..4, 0), (4..5, 1), (7..9, 0)]);
         assert_eq!(anchors.of(&[2, 5, 7].into()), [2, 3, 4, 7, 8]);
         anchors.apply(&Plan::removing(vec![0, 7]));
         assert_eq!((keyframes(&anchors), anchors.fixed().collect()), (vec![0, 2, 2, 5, 0, 0, 2], vec![2, 6]));
         anchors.apply(&Plan::default());
         assert_eq!(anchors.len(), 7);
-    }
-
-    #[test]
-    fn what_a_camera_sees_moves_with_it_but_not_for_a_refinement() {
-        let old = Se3::new(Vector3::new(1.0, 2.0, 3.0), Vector3::new(0.1, -0.4, 0.2));
-        let new = old * Se3::new(Vector3::new(0.05, 0.0, 0.0), Vector3::new(0.0, 0.03, 0.0));
-        let p_in_camera = Point3::new(0.3, -0.2, 2.0);
-        for scale in [1.0, 0.8, 1.3] {
-            let moved = motion(&old, &new, scale).unwrap().act(&(old * p_in_camera));
-            assert!((moved - new * (p_in_camera * scale)).norm() < 1e-12);
-        }
-        assert!(motion(&old, &(old * Se3::new(Vector3::new(0.0, 0.009, 0.0), Vector3::new(0.008, 0.0, 0.0))), 1.0).is_none());
-        assert!(motion(&old, &(old * Se3::new(Vector3::zeros(), Vector3::new(0.01, 0.0, 0.0))), 1.0).is_some());
-        for scale in [0.99, 1.01] {
-            assert!(motion(&old, &old, scale).is_some() && motion(&old, &old, scale.powf(0.4)).is_none());
-        }
-    }
-
-    #[test]
-    fn a_shift_counts_only_beyond_its_threshold() {
-        let shifted = |metres: f64| motion(&Se3::identity(), &Se3::translation(metres, 0.0, 0.0), 1.0);
-        assert_eq!(shifted(MIN_SHIFT_METRES), None);
-        assert_eq!(shifted(2.0 * MIN_SHIFT_METRES), Some(Se3::translation(2.0 * MIN_SHIFT_METRES, 0.0, 0.0).into()));
     }
 }

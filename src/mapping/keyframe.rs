@@ -8,7 +8,6 @@ use image::GrayImage;
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
-use super::anchors;
 use super::chunks::{Outlook, Sight};
 use super::image_store::ImageStore;
 use super::plane_sweep::{self, SourceView};
@@ -81,10 +80,6 @@ pub(super) struct MappedKeyframe {
     pub id: KeyframeId,
     /// At the tracker's pose.
     pub camera: ViewCamera,
-    /// camera_from_world at which its Gaussians were inserted, or to which they were last moved.
-    anchored_from_world: Se3,
-    /// Factor by which lengths around it have grown since then.
-    scale_since_anchor: f64,
     /// Exposure of the recorded image against the map.
     pub exposure: Exposure,
     /// Steps that learnt from it.
@@ -103,8 +98,6 @@ pub(super) struct KeyframeState {
     /// Identity, ascending in the order of tracking.
     pub id: KeyframeId,
     camera: ViewCamera,
-    anchored_from_world: Se3,
-    scale_since_anchor: f64,
     exposure: Exposure,
     steps: u32,
     covisible: Vec<KeyframeId>,
@@ -126,8 +119,6 @@ impl MappedKeyframe {
         Ok(Self {
             id: keyframe.id,
             camera,
-            anchored_from_world: camera.camera_from_world,
-            scale_since_anchor: 1.0,
             exposure: Exposure::default(),
             steps: 0,
             image: Images::new(gpu, image, with_half)?,
@@ -142,8 +133,6 @@ impl MappedKeyframe {
         Ok(KeyframeState {
             id: self.id,
             camera: self.camera,
-            anchored_from_world: self.anchored_from_world,
-            scale_since_anchor: self.scale_since_anchor,
             exposure: self.exposure,
             steps: self.steps,
             covisible: self.covisible.clone(),
@@ -173,8 +162,6 @@ impl MappedKeyframe {
         let mut restored = Self {
             id: state.id,
             camera: state.camera,
-            anchored_from_world: state.anchored_from_world,
-            scale_since_anchor: state.scale_since_anchor,
             exposure: state.exposure,
             steps: state.steps,
             gray: state.swept.as_ref().map(|_| plane_sweep::gray(&image.color)),
@@ -188,28 +175,18 @@ impl MappedKeyframe {
         Ok(Some(restored))
     }
 
-    /// How a correction moves the world around it, new_from_old.
-    pub fn motion(&self, update: &PoseUpdate) -> Sim3 {
-        let world_from_new_camera = Sim3 { scale: update.scale, ..update.world_from_camera.into() };
-        world_from_new_camera * Sim3::from(self.camera.camera_from_world)
-    }
-
-    /// Takes in a correction of the tracker. Returns the motion of its Gaussians, new_from_old, once what has added up is more than a
-    /// refinement. Its estimated depth is scaled along; measured depth stays.
+    /// Takes in a correction of the tracker. Returns how that moves the world around it, new_from_old, if it does. Its estimated depth is scaled
+    /// along; measured depth stays.
     pub fn update_pose(&mut self, gpu: &Gpu, store: &mut ImageStore, update: &PoseUpdate) -> Result<Option<Sim3>, MappingError> {
-        let camera_from_world = update.world_from_camera.inverse();
-        self.camera.camera_from_world = camera_from_world;
-        self.scale_since_anchor *= update.scale;
-        let scale = self.scale_since_anchor;
-        let motion = anchors::motion(&self.anchored_from_world.inverse(), &update.world_from_camera, scale);
-        if motion.is_some() {
-            (self.anchored_from_world, self.scale_since_anchor) = (camera_from_world, 1.0);
-            if scale != 1.0 && self.depth_is_estimated() {
-                self.image.scale_depth(gpu, store, scale)?;
-                self.sight.scale(scale as f32);
-            }
+        let old_camera_from_world = self.camera.camera_from_world;
+        self.camera.camera_from_world = update.world_from_camera.inverse();
+        if update.scale != 1.0 && self.depth_is_estimated() {
+            self.image.scale_depth(gpu, store, update.scale)?;
+            self.sight.scale(update.scale as f32);
         }
-        Ok(motion)
+        let stays = update.scale == 1.0 && self.camera.camera_from_world == old_camera_from_world;
+        let world_from_new_camera = Sim3 { scale: update.scale, ..update.world_from_camera.into() };
+        Ok((!stays).then(|| world_from_new_camera * Sim3::from(old_camera_from_world)))
     }
 
     /// Whether its image is on the GPU.

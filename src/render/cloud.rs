@@ -8,7 +8,7 @@ use bytemuck::{Pod, Zeroable};
 use glam::{Quat, Vec3};
 use serde::{Deserialize, Serialize};
 
-pub use motion::RunMotion;
+pub use motion::Motions;
 pub use part::CloudPart;
 
 use self::change::Kernels;

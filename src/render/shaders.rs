@@ -110,4 +110,5 @@ shaders! {
     DIVIDE = "divide", "divide", [VIEW], ["main"];
     APPEND = "append", "append", [VIEW], ["main"];
     FIX = "fix", "fix", [VIEW], ["main"];
+    TRANSFORM = "transform", "transform", [VIEW], ["main"];
 }

@@ -105,6 +105,11 @@ impl ShRotation {
         Self { matrix }
     }
 
+    /// Elements of the matrices of degree 1, 2 and 3, each row-major.
+    pub fn elements(&self) -> impl Iterator<Item = f64> {
+        (1..MAX_COEFFICIENTS).flat_map(move |i| band(i).map(move |j| self.matrix[(i, j)]))
+    }
+
     /// Rotates the coefficients of one Gaussian, `[K, 3]` RGB with K = [`ShDegree::coefficients`].
     pub fn rotate(&self, coefficients: &mut [Vector3<f64>]) {
         let mut old = [Vector3::zeros(); MAX_COEFFICIENTS];

@@ -17,7 +17,7 @@ pub(super) use self::balls::{Ball, parts};
 use self::index::Index;
 pub(super) use self::sight::{Hidden, Outlook, Sight};
 use self::store::{Store, Stored};
-use super::{KeyframeId, MappingError, anchors};
+use super::{KeyframeId, MappingError};
 use crate::geometry::Sim3;
 use crate::render::CloudPart;
 use crate::splat::{GaussianCloud, ShDegree};
@@ -226,7 +226,7 @@ impl Chunks {
         let mut members = self.store.get(&chunk.stored, chunk.gaussians, sh_degree)?;
         for (keyframe, new_from_old) in &chunk.motions {
             let moved: Vec<usize> = (0..chunk.gaussians).filter(|i| members.keyframes[*i] == *keyframe).collect();
-            members.part.transform(&moved, new_from_old, anchors::is_far(new_from_old, chunk.ball.center()));
+            members.part.transform(&moved, new_from_old);
         }
         Ok(members)
     }

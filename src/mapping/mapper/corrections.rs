@@ -7,26 +7,23 @@ use crate::mapping::{KeyframeId, MappingError, PoseUpdate};
 use crate::render::Plan;
 
 impl Mapper {
-    /// Moves earlier keyframes to better poses, one update each. The Gaussians inserted from a keyframe follow by a similarity once its moves
-    /// add up to more than a refinement; returns how many did. Unknown ids are those that were never sent to the mapper.
+    /// Moves earlier keyframes to better poses, one update each. The Gaussians inserted from a keyframe follow it, wherever they are; returns how
+    /// many did. Unknown ids are those that were never sent to the mapper.
     ///
     /// # Errors
     /// [`MappingError`] if a buffer does not fit or the device fails.
     pub fn update_poses(&mut self, updates: &[PoseUpdate]) -> Result<usize, MappingError> {
-        let (mut motions, mut each) = (BTreeMap::new(), BTreeMap::new());
+        let mut motions = BTreeMap::new();
         let updates: BTreeMap<KeyframeId, &PoseUpdate> = updates.iter().map(|update| (update.keyframe, update)).collect();
         for keyframe in &mut self.keyframes {
             if let Some(update) = updates.get(&keyframe.id) {
-                each.insert(keyframe.id, keyframe.motion(update));
                 let motion = keyframe.update_pose(&self.gpu, &mut self.images, update)?;
                 motions.extend(motion.map(|motion| (keyframe.id, motion)));
             }
         }
-        // Optimisation takes along what it learns; what is fixed or away follows every update.
-        let moved = self.anchors.moved(&motions, &each);
+        let moved = self.anchors.moved(&motions);
         self.cloud.transform(&self.gpu, &moved)?;
-        let away = self.chunks.transform(&each);
-        Ok(away + moved.iter().map(|motion| motion.run.len()).sum::<usize>())
+        Ok(self.chunks.transform(&motions) + moved.gaussians())
     }
 
     /// Removes keyframes and the Gaussians inserted from them; returns how many Gaussians. Unknown ids are those that were never sent.

@@ -9,19 +9,24 @@ use crate::render::plan::Plan;
 use crate::render::shaders::{self, ShaderSource};
 use crate::splat::GaussianCloud;
 
+/// Invocations of a workgroup that makes a change.
+const INVOCATIONS: u32 = 256;
+
 #[derive(Debug)]
 pub(super) struct Kernels {
     gather: Kernel,
     divide: Kernel,
     append: Kernel,
     fix: Kernel,
+    pub transform: Kernel,
 }
 
 impl Kernels {
     pub fn new(gpu: &Gpu) -> Self {
         let kernel = |source: &ShaderSource| Kernel::new(gpu, source.name, "main", &source.text(BlendForm::default()));
-        let [gather, divide, append, fix] = [&shaders::GATHER, &shaders::DIVIDE, &shaders::APPEND, &shaders::FIX].map(kernel);
-        Self { gather, divide, append, fix }
+        let sources = [&shaders::GATHER, &shaders::DIVIDE, &shaders::APPEND, &shaders::FIX, &shaders::TRANSFORM];
+        let [gather, divide, append, fix, transform] = sources.map(kernel);
+        Self { gather, divide, append, fix, transform }
     }
 }
 
@@ -57,14 +62,14 @@ impl Gathering {
     /// Gathers one buffer into another.
     pub fn gather(&self, gpu: &Gpu, (kernels, uniforms): (&Kernels, &Uniforms), from: &GpuBuffer, to: &GpuBuffer) {
         let bindings = [(0, uniforms.of(self.setup)), (1, &self.changes), (2, from), (3, to)];
-        dispatch(gpu, &kernels.gather, &bindings, self.kept + self.children);
+        dispatch(gpu, &kernels.gather, &bindings, self.kept + self.children, INVOCATIONS);
     }
 }
 
-fn dispatch(gpu: &Gpu, kernel: &Kernel, bindings: &[(u32, &GpuBuffer)], threads: u32) {
+pub(super) fn dispatch(gpu: &Gpu, kernel: &Kernel, bindings: &[(u32, &GpuBuffer)], threads: u32, of_workgroup: u32) {
     let mut encoder = gpu.device.create_command_encoder(&Default::default());
     let mut pass = encoder.begin_compute_pass(&Default::default());
-    kernel.dispatch(gpu, &mut pass, bindings, workgroups(threads.div_ceil(256)));
+    kernel.dispatch(gpu, &mut pass, bindings, workgroups(threads.div_ceil(of_workgroup)));
     drop(pass);
     gpu.submit(encoder);
 }
@@ -105,7 +110,7 @@ impl GpuCloud {
             (6, &self.histories),
         ];
         self.uniforms.upload(gpu);
-        dispatch(gpu, &self.kernels.append, &bindings, finite.len() as u32);
+        dispatch(gpu, &self.kernels.append, &bindings, finite.len() as u32, INVOCATIONS);
         self.count += finite.len();
         Ok(left_out)
     }
@@ -123,7 +128,7 @@ impl GpuCloud {
         let setup = self.uniforms.put(&FixSetup { count: self.count as u32, capacity: self.capacity as u32, pad: [0; 2] });
         self.uniforms.upload(gpu);
         let bindings = [(0, self.uniforms.of(setup)), (1, &fixed), (2, &self.moments_2)];
-        dispatch(gpu, &self.kernels.fix, &bindings, self.count as u32);
+        dispatch(gpu, &self.kernels.fix, &bindings, self.count as u32, INVOCATIONS);
         Ok(())
     }
 
@@ -165,7 +170,7 @@ impl GpuCloud {
         let Gathering { changes, kept, children, of_children, .. } = gathering;
         if children > 0 {
             let bindings = [(0, uniforms.of(of_children)), (1, &changes), (2, &*parameters), (3, &*averages), (4, &*histories)];
-            dispatch(gpu, &kernels.divide, &bindings, children);
+            dispatch(gpu, &kernels.divide, &bindings, children, INVOCATIONS);
         }
         if resized {
             (*spare, *spare_histories) = (None, None);

@@ -1,59 +1,78 @@
-//! Motion of Gaussians by similarities: centres, sizes, orientations and harmonics. On the host, because a keyframe rarely moves far.
+//! Motion of Gaussians by similarities: centres, sizes, orientations and harmonics. Of the map by a shader, of parts that are away on the host.
 
 use std::ops::Range;
 
 use glam::Quat;
-use nalgebra::{Point3, Vector3};
+use nalgebra::{Matrix3, Point3, Vector3};
 
-use super::GpuCloud;
+use super::{GpuCloud, change};
 use crate::geometry::Sim3;
-use crate::gpu::{Gpu, GpuError};
-use crate::render::layout::GEOMETRY_PLANES;
+use crate::gpu::{Gpu, GpuBuffer, GpuError};
+use crate::render::layout::{GEOMETRY_PLANES, TransformSetup};
 use crate::splat::sh::ShRotation;
 
-/// Gaussians side by side that move alike.
-#[derive(Clone, Debug, PartialEq)]
-pub struct RunMotion {
-    /// Their places in map order.
-    pub run: Range<usize>,
-    /// Motion in the world.
-    pub new_from_old: Sim3,
-    /// Whether their moments belong to where they were.
-    pub clears_moments: bool,
+/// vec4 of a motion in `shaders/transform.wgsl`: displacement, rotation, growth, and the harmonics' matrices with 83 values.
+const MOTION_ROWS: usize = 26;
+/// Invocations of one of its workgroups.
+const INVOCATIONS: u32 = 64;
+
+/// How Gaussians move.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Motions {
+    /// Motions in the world, new_from_old.
+    pub of: Vec<Sim3>,
+    /// Places in map order, ascending and apart, of Gaussians that move alike, and the place of their motion.
+    pub runs: Vec<(Range<usize>, usize)>,
+}
+
+impl Motions {
+    /// Number of Gaussians that move.
+    pub fn gaussians(&self) -> usize {
+        self.runs.iter().map(|(run, _)| run.len()).sum()
+    }
 }
 
 impl GpuCloud {
-    /// Moves runs of Gaussians, ascending.
+    /// Moves Gaussians and their averages. Moments stay as they are: directions of the world hardly turn by a correction.
     ///
     /// # Errors
-    /// [`GpuError`] if a buffer does not fit or the device fails.
-    pub fn transform(&mut self, gpu: &Gpu, motions: &[RunMotion]) -> Result<(), GpuError> {
-        let (Some(first), Some(last)) = (motions.first(), motions.last()) else { return Ok(()) };
-        let span = first.run.start..last.run.end;
-        for buffer in [&self.parameters, &self.averages] {
-            let place = |plane: usize| plane * self.capacity + span.start;
-            let parts: Vec<_> = (0..self.planes()).map(|plane| buffer.part::<[f32; 4]>(place(plane), span.len())).collect();
-            let read = gpu.read(None, &parts)?;
-            let mut planes: Vec<Vec<[f32; 4]>> = (0..self.planes()).map(|plane| read.part(plane)).collect();
-            drop(read);
-            for RunMotion { run, new_from_old, .. } in motions {
-                let run = run.start - span.start..run.end - span.start;
-                move_planes(&mut planes.iter_mut().map(|plane| &mut plane[run.clone()]).collect::<Vec<_>>(), new_from_old);
-            }
-            planes.iter().enumerate().for_each(|(plane, values)| buffer.write(gpu, place(plane), values));
+    /// [`GpuError`] if a buffer does not fit.
+    pub fn transform(&mut self, gpu: &Gpu, motions: &Motions) -> Result<(), GpuError> {
+        let (Some((first, _)), Some((last, _))) = (motions.runs.first(), motions.runs.last()) else { return Ok(()) };
+        let span = first.start as u32..last.end as u32;
+        let runs: Vec<[u32; 4]> =
+            motions.runs.iter().map(|(run, motion)| [run.start as u32, run.end as u32, *motion as u32, 0]).collect();
+        let rows: Vec<[[f32; 4]; MOTION_ROWS]> = motions.of.iter().map(rows).collect();
+        let runs_on_gpu = GpuBuffer::storage(gpu, "runs", (runs.len() * 16) as u64)?;
+        runs_on_gpu.write(gpu, 0, &runs);
+        let motions_on_gpu = GpuBuffer::storage(gpu, "motions", (rows.len() * MOTION_ROWS * 16) as u64)?;
+        motions_on_gpu.write(gpu, 0, &rows);
+        let setup = TransformSetup { first: span.start, end: span.end, capacity: self.capacity as u32, pad: 0 };
+        self.uniforms.begin();
+        let setup = self.uniforms.put(&setup);
+        self.uniforms.upload(gpu);
+        for values in [&self.parameters, &self.averages] {
+            let bindings = [(0, self.uniforms.of(setup)), (1, &runs_on_gpu), (2, &motions_on_gpu), (3, values)];
+            change::dispatch(gpu, &self.kernels.transform, &bindings, span.len() as u32, INVOCATIONS);
         }
-        let mut encoder = gpu.device.create_command_encoder(&Default::default());
-        for RunMotion { run, .. } in motions.iter().filter(|motion| motion.clears_moments) {
-            for plane in 0..self.planes() {
-                let (from, bytes) = ((plane * self.capacity + run.start) * 16, run.len() * 16);
-                for moments in [&self.moments_1, &self.moments_2] {
-                    gpu.clear(&mut encoder, moments, from as u64, Some(bytes as u64));
-                }
-            }
-        }
-        gpu.submit(encoder);
         Ok(())
     }
+}
+
+/// A motion as the shader has it. The displacement is the difference to no motion: f32 would lose a small one far from the origin.
+fn rows(new_from_old: &Sim3) -> [[f32; 4]; MOTION_ROWS] {
+    let mut rows = [[0.0; 4]; MOTION_ROWS];
+    let displacement = new_from_old.rotation.to_rotation_matrix().matrix() * new_from_old.scale - Matrix3::identity();
+    for (row, values) in rows.iter_mut().take(3).enumerate() {
+        let [x, y, z] = [0, 1, 2].map(|column| displacement[(row, column)] as f32);
+        *values = [x, y, z, new_from_old.translation[row] as f32];
+    }
+    let [x, y, z, w] = new_from_old.rotation.coords.map(|v| v as f32).into();
+    rows[3] = [w, x, y, z];
+    rows[4] = [new_from_old.scale as f32, new_from_old.scale.ln() as f32, 0.0, 0.0];
+    let harmonics = ShRotation::new(&new_from_old.rotation);
+    rows[5..].as_flattened_mut().iter_mut().zip(harmonics.elements()).for_each(|(to, element)| *to = element as f32);
+    rows
 }
 
 /// Moves Gaussians, `[planes, N]`.

@@ -12,7 +12,8 @@ use crate::gpu::{Gpu, GpuError, Part, plain};
 use crate::render::plan::Plan;
 use crate::splat::{GaussianCloud, ShDegree};
 
-/// The averages' place among the buffers.
+/// Places among the buffers.
+const PARAMETERS: usize = 0;
 const AVERAGES: usize = 3;
 
 /// Gaussians with their moments, averages and histories.
@@ -101,25 +102,22 @@ impl CloudPart {
         shown(sh_degree, antialiased, &averages)
     }
 
-    /// Moves some Gaussians as [`GpuCloud::transform`] does, and clears their moments if wanted.
-    pub fn transform(&mut self, which: &[usize], new_from_old: &Sim3, clears_moments: bool) {
+    /// Moves some Gaussians as [`GpuCloud::transform`] does.
+    pub fn transform(&mut self, which: &[usize], new_from_old: &Sim3) {
         let count = self.len();
         if which.is_empty() {
             return;
         }
         let of_buffer = self.values.len() / BUFFERS;
         for (buffer, values) in self.values.chunks_exact_mut(of_buffer).enumerate() {
-            let planes = values.chunks_exact_mut(count);
-            if buffer == 0 || buffer == AVERAGES {
-                let mut planes: Vec<&mut [[f32; 4]]> = planes.collect();
-                let mut moved: Vec<Vec<[f32; 4]>> =
-                    planes.iter().map(|plane| which.iter().map(|i| plane[*i]).collect()).collect();
-                move_planes(&mut moved.iter_mut().map(Vec::as_mut_slice).collect::<Vec<_>>(), new_from_old);
-                for (plane, moved) in planes.iter_mut().zip(moved) {
-                    which.iter().zip(moved).for_each(|(i, value)| plane[*i] = value);
-                }
-            } else if clears_moments {
-                planes.for_each(|plane| which.iter().for_each(|i| plane[*i] = [0.0; 4]));
+            if buffer != PARAMETERS && buffer != AVERAGES {
+                continue;
+            }
+            let mut planes: Vec<&mut [[f32; 4]]> = values.chunks_exact_mut(count).collect();
+            let mut moved: Vec<Vec<[f32; 4]>> = planes.iter().map(|plane| which.iter().map(|i| plane[*i]).collect()).collect();
+            move_planes(&mut moved.iter_mut().map(Vec::as_mut_slice).collect::<Vec<_>>(), new_from_old);
+            for (plane, moved) in planes.iter_mut().zip(moved) {
+                which.iter().zip(moved).for_each(|(i, value)| plane[*i] = value);
             }
         }
     }

@@ -175,6 +175,17 @@ host_twins! {
         /// Fills a vec4.
         pad: [u32; 2],
     }
+    /// Gaussians that move (`shaders/transform.wgsl`).
+    TransformSetup {
+        /// First of them.
+        first: u32,
+        /// One past the last.
+        end: u32,
+        /// Gaussians that a plane has space for.
+        capacity: u32,
+        /// Fills a vec4.
+        pad: u32,
+    }
     /// Rules of density control (`shaders/shared/density.wgsl`).
     #[derive(PartialEq)]
     DensitySetup {
