@@ -7,7 +7,7 @@ struct TransformSetup {
     capacity: u32,
 }
 
-// Of a motion: three rows of `old displacement`, new - old = M p + t with (M, t); the rotation (w, x, y, z); the scale and its logarithm; then the
+// Of a motion: three rows (M, t) of the displacement new - old = M p + t; the rotation (w, x, y, z); the scale and its logarithm; then the
 // harmonics' matrices of degree 1, 2 and 3, row-major, four values a vec4.
 const MOTION_ROWS: u32 = 26u;
 const MATRICES: u32 = 5u;
@@ -21,7 +21,7 @@ const INVOCATIONS: u32 = 64u;
 // [planes, capacity]
 @group(0) @binding(3) var<storage, read_write> values: array<vec4<f32>>;
 
-// Harmonics of one degree before the motion, for each invocation.
+// Harmonics of one degree before the motion, at most seven, for each invocation.
 var<workgroup> old: array<vec3<f32>, 448>;
 
 // Number of runs that begin at or before a Gaussian.
