@@ -117,6 +117,7 @@ fn keyframe(id: usize, bench: &HostBench) -> Keyframe {
         depth_source: DepthSource::Sensor,
         covisible: (0..id).rev().take(5).collect(),
         exposure: None,
+        image_only: false,
     }
 }
 

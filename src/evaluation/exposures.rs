@@ -20,6 +20,8 @@ pub struct ExposureRecord {
     pub log_gain: Exposure,
 }
 
+/// Timestamps of one moment in two files, to the digits of either.
+const SAME_MOMENT_S: f64 = 1e-5;
 /// A log gain beyond this is no exposure's.
 const MAX_LOG_GAIN: f32 = 5.0;
 
@@ -52,6 +54,12 @@ impl Exposures {
     /// Whether there is no record.
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()
+    }
+
+    /// Whether there is a record of this very moment.
+    pub fn has(&self, timestamp_s: f64) -> bool {
+        let at = self.0.partition_point(|r| r.timestamp_s < timestamp_s - SAME_MOMENT_S);
+        self.0.get(at).is_some_and(|r| r.timestamp_s <= timestamp_s + SAME_MOMENT_S)
     }
 
     /// At any moment: between two records in proportion, beyond them as at the nearest.

@@ -206,6 +206,7 @@ mod tests {
             depth_source: DepthSource::Sensor,
             covisible: vec![],
             exposure: None,
+            image_only: false,
         }
     }
 

@@ -34,6 +34,8 @@ pub struct Keyframe {
     pub covisible: Vec<KeyframeId>,
     /// Its exposure, if it is of a finished run: the keyframe is then only taken in, and nothing is measured or inserted.
     pub exposure: Option<Exposure>,
+    /// Whether only its image counts: it inserts no Gaussians, and no steps of its own follow it.
+    pub image_only: bool,
 }
 
 impl Keyframe {
@@ -84,6 +86,8 @@ pub(super) struct MappedKeyframe {
     pub exposure: Exposure,
     /// Steps that learnt from it.
     pub steps: u32,
+    /// Whether it inserted nothing, and the window leaves it out.
+    pub image_only: bool,
     image: Images,
     /// On the host, where depth is swept for.
     gray: Option<GrayImage>,
@@ -100,6 +104,7 @@ pub(super) struct KeyframeState {
     camera: ViewCamera,
     exposure: Exposure,
     steps: u32,
+    image_only: bool,
     covisible: Vec<KeyframeId>,
     is_resident: bool,
     /// Depth that was swept for, `[H, W]`: it depends on what the other poses were then. Nothing where the recording has it.
@@ -121,6 +126,7 @@ impl MappedKeyframe {
             camera,
             exposure: Exposure::default(),
             steps: 0,
+            image_only: keyframe.image_only,
             image: Images::new(gpu, image, with_half)?,
             gray: matches!(keyframe.depth_source, DepthSource::Landmarks { .. }).then(|| plane_sweep::gray(&image.color)),
             sight: Sight::of(image),
@@ -135,6 +141,7 @@ impl MappedKeyframe {
             camera: self.camera,
             exposure: self.exposure,
             steps: self.steps,
+            image_only: self.image_only,
             covisible: self.covisible.clone(),
             is_resident: self.is_resident(),
             swept: self.gray.is_some().then(swept).transpose()?,
@@ -164,6 +171,7 @@ impl MappedKeyframe {
             camera: state.camera,
             exposure: state.exposure,
             steps: state.steps,
+            image_only: state.image_only,
             gray: state.swept.as_ref().map(|_| plane_sweep::gray(&image.color)),
             image: images,
             sight: Sight::of(image),

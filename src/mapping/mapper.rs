@@ -26,6 +26,7 @@ pub use interlude::Interlude;
 pub use paging::PagedOut;
 pub use refine::{FinalRefinement, RefineReport};
 pub use state::MapperState;
+use steps::Taken;
 
 use super::anchors::Anchors;
 use super::chunks::{Chunks, PagingFigures};
@@ -172,6 +173,9 @@ impl Mapper {
             return Ok(KeyframeReport { id: keyframe.id, gaussians: self.gaussians(), exposure, ..KeyframeReport::default() });
         }
         self.keyframes.push(mapped);
+        if keyframe.image_only {
+            return self.follow_image(&keyframe, interlude);
+        }
         self.timed("paging", Self::page_for_window)?;
         let config = self.config.clone();
         let (candidates, survey) = std::thread::scope(|scope| {
@@ -188,7 +192,7 @@ impl Mapper {
         let insert =
             |mapper: &mut Self, candidates| mapper.insert_gaussians(&keyframe, &candidates, (survey.as_ref(), &exposure));
         let inserted = candidates.map_or(Ok(0), |candidates| self.timed("insertion", |mapper| insert(mapper, candidates)))?;
-        let first = self.keyframes.len() == 1;
+        let first = self.full_keyframes() == 1;
         let iterations = if first { self.config.first_iterations } else { self.config.iterations_per_keyframe };
         if iterations == 0 {
             return Ok(KeyframeReport {
@@ -201,6 +205,25 @@ impl Mapper {
         }
         let report = self.optimise(iterations, interlude)?;
         Ok(KeyframeReport { id: keyframe.id, inserted, gaussians: self.gaussians(), exposure, ..report })
+    }
+
+    /// What follows an image-only keyframe: its exposure is measured. In real time, steps over all keyframes go on.
+    fn follow_image(&mut self, keyframe: &Keyframe, interlude: &dyn Interlude) -> Result<KeyframeReport, MappingError> {
+        let survey = self.timed("survey", |mapper| mapper.survey(false))?;
+        let exposure = self.timed("exposure", |mapper| mapper.exposure(&keyframe.image, survey.as_ref()));
+        if let Some(newest) = self.keyframes.last_mut() {
+            newest.exposure = exposure;
+        }
+        self.limit_gpu_images()?;
+        let taken = if self.config.yields_to_keyframes { self.consolidate_until(interlude)? } else { Taken::default() };
+        let (iterations, psnr_db) = (taken.steps, taken.psnr_db());
+        let report = KeyframeReport { id: keyframe.id, gaussians: self.gaussians(), exposure, ..KeyframeReport::default() };
+        Ok(KeyframeReport { iterations, psnr_db, ..report })
+    }
+
+    /// Number of keyframes that are not image-only.
+    pub fn full_keyframes(&self) -> usize {
+        self.keyframes.iter().filter(|keyframe| !keyframe.image_only).count()
     }
 
     /// Downloads the averaged parameters of all Gaussians. Blocks until the GPU is idle.
@@ -331,7 +354,7 @@ impl Mapper {
         let (density, adam) = (&config.density, config.adam.online());
         // Where an adapter takes hundreds of steps before the next keyframe, a few more for density control delay nothing.
         let is_fast = config.yields_to_keyframes && self.step_times.len() - self.controlled_at >= config.refine.density_every;
-        let controlled = is_fast || self.keyframes.len().is_multiple_of(density.every);
+        let controlled = is_fast || self.full_keyframes().is_multiple_of(density.every);
         let mut scoring = if controlled { self.scoring_steps(&window, density) } else { Vec::new() };
         scoring.truncate(iterations);
         let unscored = iterations - scoring.len();

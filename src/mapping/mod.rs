@@ -31,5 +31,5 @@ pub use mapper::{FinalRefinement, Interlude, KeyframeReport, Mapper, MapperState
 pub use message::{InitialMap, MapperMessage, PoseUpdate};
 pub use plane_sweep::PlaneSweepConfig;
 
-/// Index of a keyframe in the order of tracking; unique and ascending.
+/// Index of a keyframe's frame in the replay; unique and ascending.
 pub type KeyframeId = usize;

@@ -2,8 +2,8 @@
 
 use fastrand::Rng;
 
-use super::WindowConfig;
 use super::keyframe::MappedKeyframe;
+use super::{KeyframeId, WindowConfig};
 use crate::optimise::ErrorPixels;
 use crate::splat::model::Dropout;
 
@@ -27,14 +27,13 @@ impl Step {
     }
 }
 
-/// The newest keyframes and the older ones that share most landmarks with the newest, newest first; indices.
+/// The newest keyframes and the older ones that share most landmarks with the newest, newest first; indices. Image-only ones are left out.
 pub(super) fn window(keyframes: &[MappedKeyframe], config: &WindowConfig) -> Vec<usize> {
-    let len = keyframes.len();
-    let recent = len.saturating_sub(config.recent);
-    let mut window: Vec<usize> = (recent..len).rev().collect();
-    let covisible = &keyframes[len - 1].covisible;
-    let older = covisible.iter().filter_map(|id| keyframes[..recent].binary_search_by_key(id, |k| k.id).ok());
-    window.extend(older.take(config.covisible));
+    let full = (0..keyframes.len()).rev().filter(|k| !keyframes[*k].image_only);
+    let mut window: Vec<usize> = full.take(config.recent).collect();
+    let (Some(&newest), Some(&oldest)) = (window.first(), window.last()) else { return window };
+    let older = |id: &KeyframeId| keyframes[..oldest].binary_search_by_key(id, |k| k.id).ok();
+    window.extend(keyframes[newest].covisible.iter().filter_map(older).take(config.covisible));
     window
 }
 

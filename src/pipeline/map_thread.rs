@@ -1,7 +1,7 @@
 //! The mapping thread: maps keyframes as they arrive, refines the map after the last one, and publishes a snapshot after each.
 
 use std::cell::RefCell;
-use std::collections::VecDeque;
+use std::collections::{BTreeMap, VecDeque};
 use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -16,15 +16,18 @@ use super::{PipelineError, Progress};
 use crate::evaluation::machine;
 use crate::gpu::Gpu;
 use crate::mapping::{
-    FinalRefinement, Interlude, KeyframeReport, Mapper, MapperMessage, MappingConfig, MappingError, PagedOut, PagingFigures,
+    FinalRefinement, Interlude, KeyframeId, KeyframeReport, Mapper, MapperMessage, MappingConfig, MappingError, PagedOut,
+    PagingFigures,
 };
 use crate::run_folder::{CheckpointError, Checkpointer, KeyframeRecord, RunState};
-use crate::splat::GaussianCloud;
+use crate::splat::{Exposure, GaussianCloud};
 
 /// Real time: the mapper pauses between two batches of steps while more frames than this wait for the tracker,
 const MOST_WAITING: usize = 2;
 /// but never longer than this.
 const LONGEST_PAUSE: Duration = Duration::from_millis(200);
+/// Image-only keyframes that may wait for the steps of a keyframe.
+const MOST_IMAGES_WAITING: usize = 4;
 /// While no message comes, viewers are attended to this often.
 const IDLE_LOOK: Duration = Duration::from_millis(50);
 
@@ -33,7 +36,10 @@ const IDLE_LOOK: Duration = Duration::from_millis(50);
 pub(super) struct MapSummary {
     /// The map after the last keyframe that was finished.
     pub cloud: Arc<GaussianCloud>,
+    /// Of all but image-only ones.
     pub keyframes: Vec<KeyframeRecord>,
+    /// Exposures of image-only keyframes.
+    pub images: BTreeMap<KeyframeId, Exposure>,
     /// Duration of each optimisation step, milliseconds.
     pub step_ms: Vec<f64>,
     /// What left the adapter for the disk.
@@ -49,6 +55,7 @@ impl MapSummary {
     /// Takes in what the mapper has in the end.
     fn finish(&mut self, mapper: &Mapper, attending: &Attending<'_>) {
         (self.step_ms, self.cloud, self.paging) = (step_ms(mapper), attending.cloud(mapper), mapper.paging());
+        self.images = mapper.image_exposures().collect();
         if mapper.has_paged_out() {
             attending.show(&self.cloud);
         }
@@ -252,7 +259,7 @@ impl MapThread<'_> {
             MapperMessage::Remove(keyframes) => (None, mapper.remove_keyframes(&keyframes)? > 0),
             MapperMessage::Keyframe(keyframe) => {
                 let report = mapper.insert(&keyframe, interlude)?;
-                (Some(report), report.inserted + report.iterations > 0)
+                ((!keyframe.image_only).then_some(report), report.inserted + report.iterations > 0)
             }
         };
         Ok(Processed { report, changed })
@@ -262,7 +269,7 @@ impl MapThread<'_> {
 /// Messages of the tracker, in order, with look-ahead.
 struct Inbox<'a> {
     messages: &'a Receiver<MapperMessage>,
-    /// Taken from the channel to look at: at most one keyframe and the pose updates before it.
+    /// Taken from the channel to look at: at most one keyframe, and what came before it.
     ahead: RefCell<VecDeque<MapperMessage>>,
 }
 
@@ -285,17 +292,20 @@ impl Inbox<'_> {
         self.ahead.borrow().len() + self.messages.len()
     }
 
-    /// Whether the next keyframe is here, or none will come any more.
+    /// Whether the next keyframe is here, or several image-only ones, or none will come any more.
     fn keyframe_waits(&self) -> bool {
         let mut ahead = self.ahead.borrow_mut();
-        let is_keyframe = |message: &MapperMessage| matches!(message, MapperMessage::Keyframe(_));
-        while !ahead.back().is_some_and(is_keyframe) {
+        loop {
+            let keyframes =
+                || ahead.iter().filter_map(|message| if let MapperMessage::Keyframe(k) = message { Some(k) } else { None });
+            if keyframes().any(|k| !k.image_only) || keyframes().count() >= MOST_IMAGES_WAITING {
+                return true;
+            }
             match self.messages.try_recv() {
                 Ok(message) => ahead.push_back(message),
                 Err(nothing) => return nothing.is_disconnected(),
             }
         }
-        true
     }
 }
 
@@ -309,6 +319,7 @@ fn wait_for_tracker(frames: &Receiver<QueuedFrame>) {
 
 /// Effects of one message.
 struct Processed {
+    /// Of a keyframe that is not image-only.
     report: Option<KeyframeReport>,
     /// Whether the map changed.
     changed: bool,
@@ -324,7 +335,7 @@ mod tests {
     use crate::mapping::{DepthSource, Keyframe};
     use crate::sequence::RectifiedImage;
 
-    fn keyframe() -> MapperMessage {
+    fn keyframe(image_only: bool) -> MapperMessage {
         let pinhole = Pinhole { fx: 8.0, fy: 8.0, cx: 3.5, cy: 3.5, width: 8, height: 8 };
         let image = RectifiedImage { pinhole, color: RgbImage::new(8, 8), depth: None, valid: None };
         let world_from_camera = Se3::identity();
@@ -335,6 +346,7 @@ mod tests {
             depth_source: DepthSource::Sensor,
             covisible: Vec::new(),
             exposure: None,
+            image_only,
         };
         MapperMessage::Keyframe(Box::new(keyframe))
     }
@@ -347,12 +359,17 @@ mod tests {
         assert!(!inbox.keyframe_waits());
         sender.send(MapperMessage::PoseUpdate(Vec::new())).unwrap();
         assert!(!inbox.keyframe_waits());
-        sender.send(keyframe()).unwrap();
-        assert!(inbox.keyframe_waits() && inbox.waiting() == 2);
+        (1..MOST_IMAGES_WAITING).for_each(|_| sender.send(keyframe(true)).unwrap());
+        assert!(!inbox.keyframe_waits());
+        sender.send(keyframe(false)).unwrap();
+        assert!(inbox.keyframe_waits() && inbox.waiting() == 1 + MOST_IMAGES_WAITING);
         let next = || inbox.next(|| Ok(())).unwrap();
         assert!(matches!(next(), Some(MapperMessage::PoseUpdate(_))));
-        assert!(matches!(next(), Some(MapperMessage::Keyframe(_))));
+        (0..MOST_IMAGES_WAITING).for_each(|_| assert!(matches!(next(), Some(MapperMessage::Keyframe(_)))));
         assert!(!inbox.keyframe_waits());
+        (0..MOST_IMAGES_WAITING).for_each(|_| sender.send(keyframe(true)).unwrap());
+        assert!(inbox.keyframe_waits());
+        (0..MOST_IMAGES_WAITING).for_each(|_| drop(next()));
         drop(sender);
         assert!(inbox.keyframe_waits() && next().is_none());
     }

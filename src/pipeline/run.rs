@@ -16,7 +16,7 @@ use super::{KeptMapper, PipelineError, Progress};
 use crate::gpu::Gpu;
 use crate::mapping::KeyframeId;
 use crate::recording::Recording;
-use crate::run_folder::{Checkpointer, Elapsed, History, RunResult};
+use crate::run_folder::{Checkpointer, Elapsed, History, RunResult, image_exposures};
 use crate::splat::GaussianCloud;
 use crate::tracking::KeyframePose;
 
@@ -138,6 +138,7 @@ fn gather(
         trajectory,
         tracking_ms: track.frames.iter().map(|frame| frame.times.total_ms()).collect(),
         history: History { frames: track.frames, keyframes: map.keyframes, loops: places(&track.loops, &track.keyframes) },
+        image_exposures: image_exposures(&track.images, &map.images),
         keyframes: track.keyframes,
         frames_read_failed: read.read_failed,
         frames_late: read.late,
@@ -153,7 +154,7 @@ fn gather(
 
 /// Loops by the places of their keyframes in the list; those of submaps that never joined are left out.
 fn places(loops: &[[KeyframeId; 2]], keyframes: &[KeyframePose]) -> Vec<[usize; 2]> {
-    let place = |id: &KeyframeId| keyframes.binary_search_by_key(id, |keyframe| keyframe.id).ok();
+    let place = |id: &KeyframeId| keyframes.binary_search_by_key(id, |keyframe| keyframe.frame_index).ok();
     loops.iter().filter_map(|[a, b]| Some([place(a)?, place(b)?])).collect()
 }
 

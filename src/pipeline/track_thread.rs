@@ -20,6 +20,8 @@ pub(super) struct TrackSummary {
     /// `(frame index, pose)` of every tracked frame, finally corrected.
     pub trajectory: Vec<(usize, StampedPose)>,
     pub keyframes: Vec<KeyframePose>,
+    /// Image-only keyframes.
+    pub images: Vec<KeyframePose>,
     pub frames: Vec<FrameRecord>,
     pub loops: Vec<[KeyframeId; 2]>,
     /// Real time: keyframes that the mapper never received.
@@ -45,13 +47,18 @@ impl<'a> KeyframeSender<'a> {
     }
 
     /// Sends a message; `false` if the mapper has closed the channel. In real time it waits in its turn while the channel is full: a keyframe
-    /// replaces one that waits, and poses those of the same keyframes.
+    /// replaces one that waits, and poses those of the same keyframes. An image-only one is left out.
     pub fn send(&mut self, message: MapperMessage) -> bool {
         if !self.real_time {
             return self.sender.send(message).is_ok();
         }
         match message {
             MapperMessage::PoseUpdate(updates) => self.add_poses(updates),
+            // One image more or less hardly counts.
+            MapperMessage::Keyframe(keyframe) if keyframe.image_only => {
+                let sent = self.waiting.is_none().then(|| self.sender.try_send(MapperMessage::Keyframe(keyframe)));
+                return !matches!(sent, Some(Err(TrySendError::Disconnected(_))));
+            }
             MapperMessage::Keyframe(keyframe) => self.deferred += usize::from(self.waiting.replace(keyframe).is_some()),
             waits @ (MapperMessage::Points(_) | MapperMessage::Map(_) | MapperMessage::Remove(_)) => {
                 return self.sender.send(waits).is_ok();
@@ -158,6 +165,7 @@ impl TrackThread<'_> {
             });
         summary.trajectory = tracker.trajectory();
         summary.keyframes = tracker.keyframes();
+        summary.images = tracker.image_only_keyframes();
         summary.depth_bias = tracker.depth_bias();
         summary.loops = loops(&tracker);
         self.progress.poses().put(poses(&tracker));
@@ -170,10 +178,10 @@ impl TrackThread<'_> {
         }
         let scales: BTreeMap<KeyframeId, f64> = adjusted.iter().map(|update| (update.id, update.scale)).collect();
         let last = |k: &KeyframePose| PoseUpdate {
-            scale: scales.get(&k.id).copied().unwrap_or(1.0),
-            ..PoseUpdate::rigid(k.id, k.world_from_camera)
+            scale: scales.get(&k.frame_index).copied().unwrap_or(1.0),
+            ..PoseUpdate::rigid(k.frame_index, k.world_from_camera)
         };
-        summary.deferred = keyframes.finish(summary.keyframes.iter().map(last).collect(), unjoined);
+        summary.deferred = keyframes.finish(summary.keyframes.iter().chain(&summary.images).map(last).collect(), unjoined);
         summary
     }
 
@@ -183,7 +191,7 @@ impl TrackThread<'_> {
         if !updates.is_empty() && !keyframes.send(MapperMessage::PoseUpdate(updates)) {
             return false;
         }
-        let Some(NewKeyframe { id, world_from_camera, seen, covisible }) = tracked.keyframe else { return true };
+        let Some(NewKeyframe { id, world_from_camera, seen, covisible, image_only }) = tracked.keyframe else { return true };
         let mut image = rectifier.rectify(frame);
         let mut depth_source = DepthSource::Sensor;
         if image.depth.is_none() && !seen.is_empty() {
@@ -191,7 +199,7 @@ impl TrackThread<'_> {
             depth_source = DepthSource::Landmarks { right: right_image(rectifier, self.recording.sequence().sensor, frame) };
         }
         let covisible = covisible.into_iter().map(|(id, _)| id).collect();
-        let keyframe = Keyframe { id, world_from_camera, image, depth_source, covisible, exposure: None };
+        let keyframe = Keyframe { id, world_from_camera, image, depth_source, covisible, exposure: None, image_only };
         keyframes.send(MapperMessage::Keyframe(Box::new(keyframe)))
     }
 }
@@ -270,13 +278,20 @@ mod tests {
     use crate::geometry::Pinhole;
     use crate::sequence::{DepthImage, RectifiedImage};
 
-    fn keyframe(id: KeyframeId) -> MapperMessage {
+    fn keyframe(id: KeyframeId, image_only: bool) -> MapperMessage {
         let pinhole = Pinhole { fx: 8.0, fy: 8.0, cx: 3.5, cy: 3.5, width: 8, height: 8 };
         let depth = DepthImage { width: 8, height: 8, metres: vec![2.0; 64] };
         let image = RectifiedImage { pinhole, color: RgbImage::new(8, 8), depth: Some(depth), valid: None };
         let depth_source = DepthSource::Landmarks { right: None };
-        let keyframe =
-            Keyframe { id, world_from_camera: Se3::identity(), image, depth_source, covisible: Vec::new(), exposure: None };
+        let keyframe = Keyframe {
+            id,
+            world_from_camera: Se3::identity(),
+            image,
+            depth_source,
+            covisible: Vec::new(),
+            exposure: None,
+            image_only,
+        };
         MapperMessage::Keyframe(Box::new(keyframe))
     }
 
@@ -289,9 +304,9 @@ mod tests {
     fn poses_that_find_the_channel_full_are_sent_later() {
         let (sender, messages) = bounded(1);
         let mut channel = KeyframeSender::new(&sender, true);
-        assert!(channel.send(keyframe(0)));
+        assert!(channel.send(keyframe(0, false)));
         assert!(channel.send(MapperMessage::PoseUpdate(vec![moved(0, 1.0, 1.0), moved(1, 2.0, 1.5)])));
-        assert!(channel.send(keyframe(2)) && channel.send(keyframe(3)));
+        assert!(channel.send(keyframe(2, false)) && channel.send(keyframe(3, false)) && channel.send(keyframe(4, true)));
         assert!(channel.send(MapperMessage::PoseUpdate(vec![moved(1, 3.0, 2.0), moved(3, 4.0, 1.25)])));
         assert!(matches!(messages.try_recv(), Ok(MapperMessage::Keyframe(k)) if k.id == 0));
         assert!(channel.retry());
@@ -304,14 +319,14 @@ mod tests {
         assert_eq!(channel.finish(Vec::new(), vec![5]), 1, "keyframe 2 was replaced");
         assert!(matches!(messages.try_recv(), Ok(MapperMessage::Remove(keyframes)) if keyframes == [5]));
         drop(messages);
-        assert!(!KeyframeSender::new(&sender, true).send(keyframe(4)));
+        assert!(!KeyframeSender::new(&sender, true).send(keyframe(4, false)));
     }
 
     #[test]
     fn final_poses_carry_the_scales_that_wait() {
         let (sender, messages) = bounded(2);
         let mut channel = KeyframeSender::new(&sender, true);
-        [0, 1, 2].into_iter().for_each(|id| assert!(channel.send(keyframe(id))));
+        [0, 1, 2].into_iter().for_each(|id| assert!(channel.send(keyframe(id, false))));
         assert!(channel.send(MapperMessage::PoseUpdate(vec![moved(0, 1.0, 2.0), moved(2, 1.0, 2.0)])));
         messages.iter().take(2).for_each(drop);
         assert_eq!(channel.finish(vec![moved(0, 3.0, 1.5), moved(1, 2.0, 1.0), moved(2, 5.0, 1.5)], Vec::new()), 0);

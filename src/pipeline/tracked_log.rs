@@ -18,7 +18,7 @@ use crate::geometry::Se3;
 use crate::gpu::Gpu;
 use crate::mapping::{MapperMessage, MappingConfig};
 use crate::recording::Recording;
-use crate::run_folder::exposures;
+use crate::run_folder::{exposures, image_exposures};
 use crate::splat::GaussianCloud;
 use crate::tracking::KeyframePose;
 
@@ -31,6 +31,7 @@ pub struct TrackedLog<'a> {
     messages: Vec<MapperMessage>,
     poses: Vec<(usize, Se3)>,
     keyframes: Vec<KeyframePose>,
+    images: Vec<KeyframePose>,
 }
 
 /// A map made from a log.
@@ -73,7 +74,7 @@ impl<'a> TrackedLog<'a> {
             return Err(error);
         }
         let poses = track.trajectory.iter().map(|(index, pose)| (*index, pose.world_from_camera)).collect();
-        Ok(Self { scene, messages: messages.into_iter().collect(), poses, keyframes: track.keyframes })
+        Ok(Self { scene, messages: messages.into_iter().collect(), poses, keyframes: track.keyframes, images: track.images })
     }
 
     /// Frame index and `world_from_camera` of every tracked frame.
@@ -108,8 +109,8 @@ impl<'a> TrackedLog<'a> {
         let config = &self.scene.as_ref().map_or_else(|| config.clone(), |scene| scene.in_units(config));
         let summary =
             MapThread { gpu, config, messages: &messages, frames: None, progress, chunks: None }.map(&mut on_round, None);
-        let MapSummary { cloud, keyframes, step_ms, error, .. } = summary;
-        let exposures = exposures(&self.keyframes, &keyframes);
+        let MapSummary { cloud, keyframes, images, step_ms, error, .. } = summary;
+        let exposures = exposures(&self.keyframes, &keyframes, &image_exposures(&self.images, &images));
         let mapped = MappedLog { cloud, exposures, wall_s: (started.elapsed() - paused).as_secs_f64(), steps: step_ms.len() };
         error.map_or(Ok(mapped), Err)
     }

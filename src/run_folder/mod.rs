@@ -15,4 +15,4 @@ pub use history::{FrameRecord, History, KeyframeRecord};
 pub use lock::FolderLock;
 pub use outputs::OutputError;
 pub use result::RunResult;
-pub(crate) use result::exposures;
+pub(crate) use result::{exposures, image_exposures};

@@ -6,8 +6,8 @@ use std::sync::Arc;
 use super::history::{History, KeyframeRecord};
 use crate::evaluation::{ExposureRecord, Exposures, metrics};
 use crate::geometry::{Se3, StampedPose, Trajectory};
-use crate::mapping::PagingFigures;
-use crate::splat::GaussianCloud;
+use crate::mapping::{KeyframeId, PagingFigures};
+use crate::splat::{Exposure, GaussianCloud};
 use crate::tracking::{DepthBias, KeyframePose};
 
 /// Trajectory, map and records of a run, whether or not it reached its end.
@@ -19,8 +19,10 @@ pub struct RunResult {
     pub poses: Vec<(usize, StampedPose)>,
     /// Poses without frame indices.
     pub trajectory: Trajectory,
-    /// All keyframes, in order of creation.
+    /// All keyframes but image-only ones, in order of creation.
     pub keyframes: Vec<KeyframePose>,
+    /// Exposures of the image-only keyframes.
+    pub image_exposures: Vec<ExposureRecord>,
     /// Records of frames and keyframes.
     pub history: History,
     /// Frames that could not be read.
@@ -67,15 +69,21 @@ impl RunResult {
 
     /// Estimated exposures of the mapped keyframes.
     pub fn exposures(&self) -> Exposures {
-        exposures(&self.keyframes, &self.history.keyframes)
+        exposures(&self.keyframes, &self.history.keyframes, &self.image_exposures)
     }
 }
 
-/// Exposures of mapped keyframes at the timestamps of tracked ones.
-pub(crate) fn exposures(tracked: &[KeyframePose], mapped: &[KeyframeRecord]) -> Exposures {
-    let times: BTreeMap<usize, f64> = tracked.iter().map(|k| (k.id, k.timestamp_s)).collect();
+/// Exposures of image-only keyframes that were tracked and mapped.
+pub(crate) fn image_exposures(tracked: &[KeyframePose], mapped: &BTreeMap<KeyframeId, Exposure>) -> Vec<ExposureRecord> {
+    let record = |k: &KeyframePose| Some(ExposureRecord { timestamp_s: k.timestamp_s, log_gain: *mapped.get(&k.frame_index)? });
+    tracked.iter().filter_map(record).collect()
+}
+
+/// Exposures of mapped keyframes at the timestamps of tracked ones, those of image-only ones among them.
+pub(crate) fn exposures(tracked: &[KeyframePose], mapped: &[KeyframeRecord], images: &[ExposureRecord]) -> Exposures {
+    let times: BTreeMap<usize, f64> = tracked.iter().map(|k| (k.frame_index, k.timestamp_s)).collect();
     let record = |KeyframeRecord { report, .. }: &KeyframeRecord| {
         Some(ExposureRecord { timestamp_s: *times.get(&report.id)?, log_gain: report.exposure })
     };
-    Exposures::new(mapped.iter().filter_map(record).collect())
+    Exposures::new(mapped.iter().filter_map(record).chain(images.iter().copied()).collect())
 }

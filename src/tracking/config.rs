@@ -52,6 +52,8 @@ pub struct TrackingConfig {
     pub keyframe_translation: f64,
     /// A keyframe is due after turning this far from the reference keyframe.
     pub keyframe_rotation_rad: f64,
+    /// Most image-only keyframes between two others, a second: the map learns from their images, and they hold no landmarks. 0: none.
+    pub images_per_second: f64,
     /// Keyframes whose poses one bundle adjustment may move.
     pub window_keyframes: usize,
     /// Levenberg-Marquardt steps in each of the two rounds of one bundle adjustment. 0 turns it off.
@@ -85,6 +87,7 @@ impl Default for TrackingConfig {
             keyframe_overlap: 0.8,
             keyframe_translation: 0.06,
             keyframe_rotation_rad: 0.12,
+            images_per_second: 10.0,
             window_keyframes: 24,
             bundle_iterations: 5,
             keyframe_culling: true,
@@ -136,6 +139,9 @@ impl TrackingConfig {
         number("keyframe_overlap", self.keyframe_overlap, 0.0, 1.0)?;
         number("keyframe_translation", self.keyframe_translation, 0.0, 100.0)?;
         number("keyframe_rotation_rad", self.keyframe_rotation_rad, 0.0, std::f64::consts::PI)?;
+        if !(0.0..=1e3).contains(&self.images_per_second) {
+            return Err(format!("tracking.images_per_second is {}; it must be from 0 to 1000", self.images_per_second));
+        }
         count("window_keyframes", self.window_keyframes, 2, 50)?;
         count("bundle_iterations", self.bundle_iterations, 0, 100)
     }

@@ -30,6 +30,7 @@ pub use loop_closing::ClosedLoop;
 pub use self_calibration::{SelfCalibration, SelfCalibrationError, self_calibrate};
 pub use solvers::depth_bias::DepthBias;
 pub use tracker::Tracker;
+pub(crate) use tracker::keyframe_selection::is_image_due;
 
 use nalgebra::Vector2;
 use serde::{Deserialize, Serialize};
@@ -54,7 +55,7 @@ pub struct TrackedFrame {
     pub world_from_camera: Option<Se3>,
     /// Landmarks that agree with the pose.
     pub inliers: usize,
-    /// Set if this frame became a keyframe.
+    /// Set if this frame became a keyframe, image-only or not.
     pub keyframe: Option<NewKeyframe>,
     /// Earlier keyframes that bundle adjustment or a closed loop moved, as they were taken in with this frame.
     pub updates: Vec<KeyframeUpdate>,
@@ -65,15 +66,17 @@ pub struct TrackedFrame {
 /// A frame that became a keyframe.
 #[derive(Clone, Debug, PartialEq)]
 pub struct NewKeyframe {
-    /// Counts from 0 in the order of creation.
+    /// Index of its frame in the replay.
     pub id: usize,
     /// Before its bundle adjustment, whose result follows as an update.
     pub world_from_camera: Se3,
     /// Where it sees landmarks, and how far along z: pixels of the distortion-free pinhole, metres. For the mapper of a camera without a
     /// depth image; empty where frames have one.
     pub seen: Vec<(Vector2<f64>, f64)>,
-    /// Other keyframes (id) and how many landmarks they share with this one, strongest first.
+    /// Other keyframes (id) and how many landmarks they share with this one, strongest first; of an image-only one none are named.
     pub covisible: Vec<(usize, usize)>,
+    /// Whether only its image counts: it holds no landmarks.
+    pub image_only: bool,
 }
 
 /// Correction of an earlier keyframe.
@@ -90,9 +93,7 @@ pub struct KeyframeUpdate {
 /// A keyframe as currently estimated.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct KeyframePose {
-    /// Number in the order of creation, from 0.
-    pub id: usize,
-    /// Index of its frame in the replay.
+    /// Index of its frame in the replay, by which others name it.
     pub frame_index: usize,
     /// Seconds, by the clock of the recording.
     pub timestamp_s: f64,
@@ -101,7 +102,7 @@ pub struct KeyframePose {
 }
 
 impl KeyframePose {
-    /// The pose with its time, without the keyframe's number.
+    /// The pose with its time, without the frame.
     pub fn stamped(&self) -> StampedPose {
         StampedPose { timestamp_s: self.timestamp_s, world_from_camera: self.world_from_camera }
     }

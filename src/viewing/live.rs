@@ -298,7 +298,7 @@ impl Observer {
 fn frames(poses: Option<&KeyframePoses>) -> Frames {
     let Some(poses) = poses else { return Frames::default() };
     let views = poses.keyframes.iter().map(|k| KeyframeView {
-        id: k.id,
+        id: k.frame_index,
         frame: k.frame_index,
         t: k.timestamp_s,
         pose: (&k.world_from_camera).into(),

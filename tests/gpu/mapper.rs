@@ -17,7 +17,15 @@ pub fn keyframe(id: usize, with_depth: bool) -> Keyframe {
     let depth = with_depth.then(|| DepthImage { width, height, metres: vec![2.0; (width * height) as usize] });
     let image = RectifiedImage { pinhole: PINHOLE, color, depth, valid: None };
     let world_from_camera = Se3::translation(0.01 * id as f64, 0.0, 0.0);
-    Keyframe { id, world_from_camera, image, depth_source: DepthSource::Sensor, covisible: Vec::new(), exposure: None }
+    Keyframe {
+        id,
+        world_from_camera,
+        image,
+        depth_source: DepthSource::Sensor,
+        covisible: Vec::new(),
+        exposure: None,
+        image_only: false,
+    }
 }
 
 #[test]
@@ -96,6 +104,41 @@ fn steps_over_all_keyframes_follow_each_one() {
     let mut resumed = Mapper::restore(gpu, &config, &state, None).unwrap();
     (0..12).for_each(|id| resumed.insert_again(&keyframe(id, true), &state).unwrap());
     [&mut mapper, &mut resumed].into_iter().for_each(|mapper| insert(mapper, 12..17));
+    assert_eq!(mapper.download().unwrap(), resumed.download().unwrap());
+}
+
+/// An image-only keyframe changes nothing when it comes, and is learnt from afterwards.
+#[test]
+fn image_only_keyframes_are_learnt_from_and_insert_nothing() {
+    let Some(gpu) = adapter() else { return };
+    let mut config = MappingConfig { first_iterations: 5, iterations_per_keyframe: 5, ..Default::default() };
+    (config.refine.steps_per_keyframe, config.refine.final_epochs) = (0, 4);
+    let mut mapper = Mapper::new(gpu.clone(), &config).unwrap();
+    mapper.insert(&keyframe(0, true), &|| false).unwrap();
+    let before = mapper.download().unwrap();
+    let dim = |id: usize| {
+        let mut seen = Keyframe { image_only: true, ..keyframe(id, true) };
+        seen.image.color.pixels_mut().for_each(|pixel| pixel.0 = pixel.0.map(|value| value / 2));
+        seen
+    };
+    for id in 1..4 {
+        let report = mapper.insert(&dim(id), &|| false).unwrap();
+        assert_eq!((report.inserted, report.iterations, report.gaussians), (0, 0, before.len()), "{report:?}");
+        assert!(report.exposure.0.iter().all(|gain| *gain < -0.1), "{report:?}");
+    }
+    assert_eq!(mapper.download().unwrap(), before);
+    assert_eq!((mapper.full_keyframes(), mapper.image_exposures().map(|(id, _)| id).collect::<Vec<_>>()), (1, vec![1, 2, 3]));
+    // A checkpoint of it is gone on from.
+    let state = mapper.state(None).unwrap();
+    let mut resumed = Mapper::restore(gpu, &config, &state, None).unwrap();
+    resumed.insert_again(&keyframe(0, true), &state).unwrap();
+    (1..4).for_each(|id| resumed.insert_again(&dim(id), &state).unwrap());
+    for mapper in [&mut mapper, &mut resumed] {
+        let steps = mapper.step_times().len();
+        let mut refinement = mapper.begin_refinement().unwrap();
+        while mapper.refine(&mut refinement, &|| false).unwrap().is_some() {}
+        assert!(mapper.step_times().len() >= steps + 4, "as many as for one keyframe");
+    }
     assert_eq!(mapper.download().unwrap(), resumed.download().unwrap());
 }
 

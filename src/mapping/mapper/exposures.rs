@@ -12,6 +12,11 @@ impl Mapper {
         self.keyframes.iter().map(|keyframe| (keyframe.id, keyframe.exposure))
     }
 
+    /// Those of the image-only keyframes.
+    pub fn image_exposures(&self) -> impl Iterator<Item = (KeyframeId, Exposure)> {
+        self.keyframes.iter().filter(|keyframe| keyframe.image_only).map(|keyframe| (keyframe.id, keyframe.exposure))
+    }
+
     /// The exposure of the newest keyframe's image, of which the map shows what was surveyed. A map that no step has moved yet shows nothing that counts.
     pub(super) fn exposure(&self, image: &RectifiedImage, survey: Option<&Survey>) -> Exposure {
         let (config, last) =

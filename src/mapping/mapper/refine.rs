@@ -184,7 +184,7 @@ impl Mapper {
         let mut config = self.config.refine.clone();
         config.steps = match config.seconds {
             Some(_) => usize::MAX,
-            None => config.steps.max(config.final_epochs * self.keyframes.len()),
+            None => config.steps.max(config.final_epochs * self.full_keyframes()),
         };
         let started = config.seconds.map(|_| Instant::now());
         // Each Gaussian's own views get their turn.

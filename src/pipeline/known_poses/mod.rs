@@ -1,6 +1,6 @@
 //! Replaces tracking where the recording provides poses.
 //!
-//! Photos become keyframes all, frames of a moving camera by the tracker's keyframe thresholds; held-out ones never.
+//! Photos become keyframes all, frames of a moving camera by the tracker's thresholds, and image-only ones between them; held-out ones never.
 //! Frames without a pose count as lost. Where the recording has no depth, points begin the map: its own, or triangulated ones, which the
 //! plane sweep then uses as landmarks. A map of others begins it where one is given. The world's unit is that of the poses. A finished run that
 //! is refined has keyframes of its own.
@@ -22,7 +22,7 @@ use crate::mapping::{DepthSource, Keyframe, MapperMessage};
 use crate::recording::Recording;
 use crate::run_folder::FrameRecord;
 use crate::sequence::{Frame, Rectifiers, Sensor};
-use crate::tracking::{KeyframePose, StageTimes};
+use crate::tracking::{KeyframePose, StageTimes, is_image_due};
 
 /// Neighbours that a keyframe names.
 const COVISIBLE: usize = 10;
@@ -34,11 +34,18 @@ struct Known {
     distance: f64,
 }
 
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Due {
+    Full,
+    ImageOnly,
+}
+
 struct Follower<'a> {
     recording: &'a Recording,
     scene: &'a Scene<'a>,
     rectifiers: Rectifiers,
     keyframes: Vec<Known>,
+    images: Vec<KeyframePose>,
 }
 
 impl Follower<'_> {
@@ -56,19 +63,30 @@ impl Follower<'_> {
         self.scene.refined().map_or_else(known, of_run)
     }
 
-    fn is_due(&self, index: usize, world_from_camera: &Se3) -> bool {
+    /// Whether a frame becomes a keyframe, and which.
+    fn due(&self, frame: &Frame, world_from_camera: &Se3) -> Option<Due> {
+        let due = |image_only| if image_only { Due::ImageOnly } else { Due::Full };
         if let Some(refined) = self.scene.refined() {
-            return refined.keyframes.contains_key(&index);
+            return refined.keyframes.get(&frame.index).map(|keyframe| due(keyframe.image_only));
+        }
+        if self.recording.config().replay.is_held_out(frame.index) {
+            return None;
         }
         let photos = self.recording.sequence().layout.is_photos();
-        let far = |last: &Known| self.apart(last, world_from_camera) >= 1.0;
-        !self.recording.config().replay.is_held_out(index) && (photos || self.keyframes.last().is_none_or(far))
+        let Some(last) = self.keyframes.last().filter(|_| !photos) else { return Some(Due::Full) };
+        if self.apart(last, world_from_camera) >= 1.0 {
+            return Some(Due::Full);
+        }
+        let newest = self.images.last().filter(|image| image.frame_index > last.pose.frame_index).unwrap_or(&last.pose);
+        let motion = self.apart(&Known { pose: *newest, distance: last.distance }, world_from_camera);
+        let since_s = frame.timestamp_s - newest.timestamp_s;
+        is_image_due(since_s, motion, &self.recording.config().tracking).then_some(Due::ImageOnly)
     }
 
     /// The nearest keyframes, nearest first.
     fn covisible(&self, world_from_camera: &Se3) -> Vec<usize> {
         let mut nearest: Vec<(f64, usize)> =
-            self.keyframes.iter().map(|known| (self.apart(known, world_from_camera), known.pose.id)).collect();
+            self.keyframes.iter().map(|known| (self.apart(known, world_from_camera), known.pose.frame_index)).collect();
         nearest.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
         nearest.into_iter().take(COVISIBLE).map(|(_, id)| id).collect()
     }
@@ -77,7 +95,7 @@ impl Follower<'_> {
         KeyframePoses { keyframes: self.keyframes.iter().map(|known| known.pose).collect(), loops: Vec::new() }
     }
 
-    fn make_keyframe(&mut self, frame: &Frame, world_from_camera: Se3) -> Keyframe {
+    fn make_keyframe(&mut self, frame: &Frame, world_from_camera: Se3, due: Due) -> Keyframe {
         let sequence = self.recording.sequence();
         let rectifier = self.rectifiers.of(sequence.camera_of(frame.index));
         let mut image = rectifier.rectify(frame);
@@ -86,15 +104,19 @@ impl Follower<'_> {
             image.depth = Some(rectifier.sparse_depth(&landmarks));
             depth_source = DepthSource::Landmarks { right: right_image(&rectifier, sequence.sensor, frame) };
         }
-        let (id, covisible) = (self.keyframes.len(), self.covisible(&world_from_camera));
-        let pose = KeyframePose { id, frame_index: frame.index, timestamp_s: frame.timestamp_s, world_from_camera };
+        let covisible = self.covisible(&world_from_camera);
+        let pose = KeyframePose { frame_index: frame.index, timestamp_s: frame.timestamp_s, world_from_camera };
         let distance = image.median_depth_metres().unwrap_or_else(|| self.scene.distance());
-        self.keyframes.push(Known { pose, distance });
+        match due {
+            Due::Full => self.keyframes.push(Known { pose, distance }),
+            Due::ImageOnly => self.images.push(pose),
+        }
         let refined = self.scene.refined().and_then(|refined| refined.keyframes.get(&frame.index));
         if let Some(valid) = refined.and_then(|keyframe| keyframe.valid.as_ref()) {
             image.restrict(valid);
         }
-        Keyframe { id, world_from_camera, image, depth_source, covisible, exposure: refined.map(|keyframe| keyframe.exposure) }
+        let (exposure, image_only) = (refined.map(|keyframe| keyframe.exposure), due == Due::ImageOnly);
+        Keyframe { id: frame.index, world_from_camera, image, depth_source, covisible, exposure, image_only }
     }
 }
 
@@ -104,7 +126,8 @@ pub(super) fn follow(thread: &TrackThread<'_>, scene: &Scene<'_>) -> TrackSummar
     let (sequence, config) = (recording.sequence(), recording.config());
     let mut summary = TrackSummary::default();
     let mut sender = KeyframeSender::new(mapper, config.replay.real_time);
-    let mut follower = Follower { recording, scene, rectifiers: Rectifiers::new(config.map_scale), keyframes: Vec::new() };
+    let mut follower =
+        Follower { recording, scene, rectifiers: Rectifiers::new(config.map_scale), keyframes: Vec::new(), images: Vec::new() };
     let first = match scene.initial_map() {
         Some(map) => Some(MapperMessage::Map(map)),
         None => (sequence.sensor != Sensor::Rgbd).then(|| MapperMessage::Points(scene.thinned_points())),
@@ -124,8 +147,8 @@ pub(super) fn follow(thread: &TrackThread<'_>, scene: &Scene<'_>) -> TrackSummar
             if scene.refined().is_none() {
                 summary.trajectory.push((frame.index, StampedPose { timestamp_s: frame.timestamp_s, world_from_camera }));
             }
-            if follower.is_due(frame.index, &world_from_camera) {
-                keyframe = Some(guarded("tracking", || Ok(follower.make_keyframe(&frame, world_from_camera))));
+            if let Some(due) = follower.due(&frame, &world_from_camera) {
+                keyframe = Some(guarded("tracking", || Ok(follower.make_keyframe(&frame, world_from_camera, due))));
             }
         }
         let times = StageTimes { features_ms: started.elapsed().as_secs_f64() * 1e3, ..StageTimes::default() };
@@ -152,5 +175,6 @@ pub(super) fn follow(thread: &TrackThread<'_>, scene: &Scene<'_>) -> TrackSummar
     summary.deferred = sender.finish(Vec::new(), Vec::new());
     progress.poses().put(follower.poses());
     summary.keyframes = follower.poses().keyframes;
+    summary.images = follower.images;
     summary
 }

@@ -32,6 +32,7 @@ pub(super) struct RefinedKeyframe {
     pub exposure: Exposure,
     /// `[height * width]` of the mapping resolution: pixels that show the region or its halo; `None`: all.
     pub valid: Option<Arc<[bool]>>,
+    pub image_only: bool,
 }
 
 /// What of a run is refined.
@@ -64,12 +65,16 @@ impl Refined {
         };
         let exposures_file = config.run.join(outputs::EXPOSURES);
         let exposures = Exposures::read(&exposures_file).map_err(|reason| wrong(exposures_file, reason))?;
-        let keyframe = |(frame, pose): (usize, StampedPose)| {
+        let keyframe = |(frame, pose): (usize, StampedPose), image_only| {
             let exposure = exposures.at(pose.timestamp_s);
-            (frame, RefinedKeyframe { world_from_camera: pose.world_from_camera, exposure, valid: None })
+            (frame, RefinedKeyframe { world_from_camera: pose.world_from_camera, exposure, valid: None, image_only })
         };
-        let keyframes = poses(outputs::KEYFRAMES)?.into_iter().map(keyframe).collect();
-        let whole = Self { trajectory: poses(outputs::TRAJECTORY)?, keyframes, map: InitialMap { cloud: map, frozen: 0 } };
+        // Image-only keyframes have exposures and are not in the list.
+        let trajectory = poses(outputs::TRAJECTORY)?;
+        let exposed = trajectory.iter().filter(|(_, pose)| exposures.has(pose.timestamp_s));
+        let mut keyframes: BTreeMap<usize, RefinedKeyframe> = exposed.map(|found| keyframe(*found, true)).collect();
+        keyframes.extend(poses(outputs::KEYFRAMES)?.into_iter().map(|found| keyframe(found, false)));
+        let whole = Self { trajectory, keyframes, map: InitialMap { cloud: map, frozen: 0 } };
         match config.region {
             Some(region) => whole.within(&region, recording),
             None => Ok(whole),

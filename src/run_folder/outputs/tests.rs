@@ -128,18 +128,17 @@ fn pose(x: f64) -> Se3 {
 /// Three tracked frames and two keyframes, the second of which was mapped.
 fn result() -> RunResult {
     let stamped = |i: usize| StampedPose { timestamp_s: i as f64 / 10.0, world_from_camera: pose(i as f64) };
-    let keyframe = |id: usize, frame_index: usize| KeyframePose {
-        id,
+    let keyframe = |frame_index: usize| KeyframePose {
         frame_index,
         timestamp_s: frame_index as f64 / 10.0,
         world_from_camera: pose(frame_index as f64 + 0.5),
     };
-    let report = KeyframeReport { id: 1, exposure: Exposure([0.1, 0.2, 0.3]), ..KeyframeReport::default() };
+    let report = KeyframeReport { id: 3, exposure: Exposure([0.1, 0.2, 0.3]), ..KeyframeReport::default() };
     let record = KeyframeRecord { report, done_s: 1.0, busy_s: 0.5, waiting: 0, host_bytes: None };
     RunResult {
         poses: vec![(0, stamped(0)), (2, stamped(2)), (3, stamped(3))],
         trajectory: Trajectory { poses: vec![stamped(0), stamped(2), stamped(3)] },
-        keyframes: vec![keyframe(0, 0), keyframe(1, 3)],
+        keyframes: vec![keyframe(0), keyframe(3)],
         history: History {
             frames: vec![FrameRecord { frame: 0, lost: false, times: StageTimes::default() }],
             keyframes: vec![record],

@@ -7,7 +7,8 @@
 
 use std::time::Instant;
 
-use super::{Tracker, milliseconds};
+use super::{Record, Tracker, milliseconds};
+use crate::geometry::Se3;
 use crate::sequence::Sensor;
 use crate::tracking::adjustment::local_bundle::Adjustment;
 use crate::tracking::map::keyframe_culling::{cull_around, thin};
@@ -79,6 +80,7 @@ impl Tracker {
     pub fn finish(&mut self) -> Result<Vec<KeyframeUpdate>, TrackingError> {
         self.take_in_all()?;
         self.adjust_all();
+        self.settle_frames(self.map.keyframes.len());
         Ok(self.updates())
     }
 
@@ -168,6 +170,7 @@ impl Tracker {
         self.rig.depth_bias = solved.bias().unwrap_or(self.rig.depth_bias);
         times.bundle_ms += milliseconds(clock);
         self.close_loops_and_cull(under_way.around, times);
+        self.settle_old_frames();
         self.follow_keyframe();
         self.begin_next(times)
     }
@@ -257,9 +260,20 @@ impl Tracker {
 
     /// Keyframes that moved since the last call.
     pub(super) fn updates(&mut self) -> Vec<KeyframeUpdate> {
-        let pose = |id: usize| self.map.keyframes[id].camera_from_world.inverse();
-        let moved = std::mem::take(&mut self.moved).into_iter();
-        moved.map(|(id, scale)| KeyframeUpdate { id, world_from_camera: pose(id), scale }).collect()
+        let (moved, images) = (std::mem::take(&mut self.moved), self.frames.take_moved());
+        let update =
+            |id, camera_from_world: Se3, scale| KeyframeUpdate { id, world_from_camera: camera_from_world.inverse(), scale };
+        let of_image = |record: &Record, scale| update(record.frame_index, record.pose(&self.map), scale);
+        let mut updates = Vec::new();
+        for (k, scale) in &moved {
+            let keyframe = &self.map.keyframes[*k];
+            updates.push(update(keyframe.frame_index, keyframe.camera_from_world, *scale));
+            updates.extend(self.frames.images_of(*k).iter().map(|record| of_image(&self.records[*record], *scale)));
+        }
+        let alone = images.iter().map(|record| &self.records[*record]).filter(|record| !moved.contains_key(&record.reference));
+        updates.extend(alone.map(|record| of_image(record, 1.0)));
+        updates.sort_by_key(|update| update.id);
+        updates
     }
 }
 
@@ -267,7 +281,7 @@ impl Tracker {
 mod tests {
     use super::*;
     use crate::geometry::sim3::{self, Vector7};
-    use crate::geometry::{Camera, Distortion, Se3, Sim3, se3};
+    use crate::geometry::{Camera, Distortion, Sim3, se3};
     use crate::tracking::TrackingConfig;
     use crate::tracking::loop_closing::tests::drifted;
     use crate::tracking::solvers::residual::tests::PINHOLE;

@@ -1,5 +1,6 @@
 //! When a frame becomes a keyframe: by how little of the reference keyframe is still seen, and by how far the camera has moved.
 
+use crate::geometry::Se3;
 use crate::tracking::TrackingConfig;
 use crate::tracking::features::frame_features::FrameFeatures;
 use crate::tracking::localisation::localise::Localised;
@@ -13,6 +14,10 @@ const MANY_NEW: usize = 100;
 /// Share of the motion thresholds that the camera must have moved before a smaller overlap counts: a frame that is only blurred loses
 /// landmarks too, and keyframes from one place hold the map by nothing.
 const LEAST_MOTION: f64 = 0.25;
+/// Timestamps scatter: share of the interval between image-only keyframes after which the next is due,
+const IMAGE_INTERVAL_SHARE: f64 = 0.9;
+/// if the camera has moved by this share of what a keyframe needs.
+const LEAST_IMAGE_MOTION: f64 = 0.02;
 /// Below this overlap the motion no longer matters.
 const LOW_OVERLAP: f64 = 0.25;
 
@@ -24,12 +29,7 @@ pub fn is_due(map: &Map, frame: &FrameFeatures, found: &Localised, reference: us
     let expected = view.landmark_count(map, observations);
     let overlap = found.inliers as f64 / expected.max(1) as f64;
 
-    let camera_from_reference = found.camera_from_world * view.camera_from_world.inverse();
-    let depth = frame.median_depth().or_else(|| map.median_depth(reference)).unwrap_or(1.0);
-    // 1 where the camera has moved or turned as far as a keyframe needs.
-    let moved = camera_from_reference.translation.vector.norm() / (config.keyframe_translation * depth);
-    let turned = camera_from_reference.rotation.angle() / config.keyframe_rotation_rad;
-    let motion = moved.max(turned);
+    let motion = motion(map, frame, [&view.camera_from_world, &found.camera_from_world], reference, config);
 
     let with_depth = |tracked: bool| {
         let pairs = frame.features.iter().zip(&found.landmarks);
@@ -38,4 +38,19 @@ pub fn is_due(map: &Map, frame: &FrameFeatures, found: &Localised, reference: us
     let new_view = with_depth(true) < FEW_TRACKED && with_depth(false) > MANY_NEW;
     let changed = overlap < config.keyframe_overlap || new_view;
     motion > 1.0 || overlap < LOW_OVERLAP || (changed && motion > LEAST_MOTION)
+}
+
+/// Whether a frame that is no keyframe is worth an image-only one: so many seconds after the last keyframe of either kind, after so much motion, as a
+/// share of what a keyframe needs.
+pub fn is_image_due(since_s: f64, motion: f64, config: &TrackingConfig) -> bool {
+    since_s.abs() * config.images_per_second >= IMAGE_INTERVAL_SHARE && motion >= LEAST_IMAGE_MOTION
+}
+
+/// How far the camera has moved or turned between two poses (camera_from_world), as a share of what a keyframe needs. Where the frame has no depth,
+/// `reference` has the scene's.
+pub fn motion(map: &Map, frame: &FrameFeatures, [before, after]: [&Se3; 2], reference: usize, config: &TrackingConfig) -> f64 {
+    let after_from_before = after * before.inverse();
+    let depth = frame.median_depth().or_else(|| map.median_depth(reference)).unwrap_or(1.0);
+    let moved = after_from_before.translation.vector.norm() / (config.keyframe_translation * depth);
+    moved.max(after_from_before.rotation.angle() / config.keyframe_rotation_rad)
 }

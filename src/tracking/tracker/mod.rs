@@ -6,7 +6,8 @@
 mod adjusting;
 mod closing;
 mod dense_fallback;
-mod keyframe_selection;
+mod frames;
+pub mod keyframe_selection;
 mod start;
 mod submaps;
 
@@ -16,6 +17,7 @@ use std::time::Instant;
 
 use adjusting::Adjusting;
 use closing::Closing;
+use frames::{Frames, Record, Sightings};
 
 use crate::geometry::{Camera, Se3, StampedPose};
 use crate::sequence::{Frame, Sensor};
@@ -62,6 +64,7 @@ pub struct Tracker {
     /// Timestamp of the frame before, and its distance from the one before it, seconds.
     arrival: Option<(f64, Option<f64>)>,
     records: Vec<Record>,
+    frames: Frames,
     adjusting: Adjusting,
     closing: Closing,
     /// Keyframes that moved since the last tracked frame, and the factor by which lengths around each have grown.
@@ -97,16 +100,6 @@ struct DenseState {
     keyframe: Option<(usize, Arc<DenseFrame>)>,
 }
 
-/// A tracked frame, held by its reference keyframe.
-#[derive(Clone, Copy, Debug)]
-struct Record {
-    frame_index: usize,
-    timestamp_s: f64,
-    reference: usize,
-    /// In the reference keyframe's unit of length.
-    camera_from_reference: Se3,
-}
-
 impl Tracker {
     /// A tracker for one camera.
     ///
@@ -138,6 +131,7 @@ impl Tracker {
             frames_seen: 0,
             arrival: None,
             records: Vec::new(),
+            frames: Frames::default(),
             adjusting: Adjusting::new(worker),
             closing: Closing::start(pinhole, steps)?,
             moved: BTreeMap::new(),
@@ -181,7 +175,7 @@ impl Tracker {
             None => self.start(frame, may_be_keyframe, times),
         };
         if tracked.state == TrackingState::Tracking {
-            self.keep_dense(frame.dense.clone(), tracked.keyframe.is_some());
+            self.keep_dense(frame.dense.clone(), tracked.keyframe.as_ref().is_some_and(|k| !k.image_only));
         }
         tracked.updates = self.updates();
         Ok(tracked)
@@ -213,29 +207,29 @@ impl Tracker {
     /// corrections of keyframes move it. Lost frames are absent, and those of submaps that never joined the largest one.
     pub fn trajectory(&self) -> Vec<(usize, StampedPose)> {
         let largest = self.largest_submap();
-        let pose = |r: &Record| self.map.keyframes[r.reference].carry(&r.camera_from_reference).inverse();
         self.records
             .iter()
             .filter(|r| self.map.keyframes[r.reference].root == largest)
-            .map(|r| (r.frame_index, StampedPose { timestamp_s: r.timestamp_s, world_from_camera: pose(r) }))
+            .map(|r| (r.frame_index, StampedPose { timestamp_s: r.timestamp_s, world_from_camera: r.pose(&self.map).inverse() }))
             .collect()
     }
 
     /// The keyframes of the largest submap with their current poses.
     pub fn keyframes(&self) -> Vec<KeyframePose> {
-        let pose = |(id, k): (usize, &Keyframe)| KeyframePose {
-            id,
+        let pose = |k: &Keyframe| KeyframePose {
             frame_index: k.frame_index,
             timestamp_s: k.timestamp_s,
             world_from_camera: k.camera_from_world.inverse(),
         };
         let largest = self.largest_submap();
-        self.map.keyframes.iter().enumerate().filter(|(_, k)| k.root == largest).map(pose).collect()
+        self.map.keyframes.iter().filter(|k| k.root == largest).map(pose).collect()
     }
 
     /// Loops closed so far, submaps joined among them.
     pub fn loops(&self) -> Vec<ClosedLoop> {
-        self.loops.loops()
+        let id = |k: usize| self.map.keyframes[k].frame_index;
+        let loops = self.loops.loops().into_iter();
+        loops.map(|closed| ClosedLoop { keyframe: id(closed.keyframe), place: id(closed.place), ..closed }).collect()
     }
 
     /// Bias of the depth images; `None` if it is not estimated.
@@ -315,9 +309,19 @@ impl Tracker {
             may_be_keyframe && keyframe_selection::is_due(&self.map, &features, &found, self.motion.reference, &self.rig.config);
         let Localised { camera_from_world, landmarks, inliers, dense, .. } = found;
         let camera_from_reference = self.map.keyframes[self.motion.reference].relative(&camera_from_world);
-        self.record(frame, self.motion.reference, camera_from_reference);
+        let sightings = if dense { Sightings::default() } else { Sightings::new(&features, &landmarks, &self.map, &self.rig) };
+        self.record(frame, self.motion.reference, camera_from_reference, sightings);
+        let motion = |before: &Se3| {
+            let between = [before, &camera_from_world];
+            keyframe_selection::motion(&self.map, &features, between, self.motion.reference, &self.rig.config)
+        };
+        let image_due = may_be_keyframe && !due && !dense && self.is_image_due(motion);
         self.motion.last = Some(LastFrame { features, camera_from_world, landmarks });
-        let new_keyframe = if due { self.make_keyframe(frame, !dense, &mut times)? } else { None };
+        let new_keyframe = match (due, image_due) {
+            (true, _) => self.make_keyframe(frame, !dense, &mut times)?,
+            (false, true) => self.make_image_only(),
+            (false, false) => None,
+        };
         Ok(TrackedFrame {
             state: TrackingState::Tracking,
             world_from_camera: self.motion.last.as_ref().map(|l| l.camera_from_world.inverse()),
@@ -348,7 +352,8 @@ impl Tracker {
         times.mapping_ms += milliseconds(clock);
         self.motion.reference = id;
         self.records.pop();
-        self.record(frame, id, Se3::identity());
+        self.record(frame, id, Se3::identity(), Sightings::default());
+        self.note_mapped();
         self.motion.last = Some(LastFrame { features, camera_from_world, landmarks: self.map.keyframes[id].landmarks.clone() });
         self.adjust_around(id, held, times)?;
         // Its pose and its landmarks' depths go out with itself.
@@ -366,11 +371,14 @@ impl Tracker {
             _ => pairs.filter_map(|(f, l)| l.map(|l| (f.pixel, depth(l)))).filter(|(_, z)| *z > 0.0).collect(),
         };
         let world_from_camera = keyframe.camera_from_world.inverse();
-        NewKeyframe { id, world_from_camera, seen, covisible: self.map.covisible(id) }
+        let covisible =
+            self.map.covisible(id).into_iter().map(|(k, shared)| (self.map.keyframes[k].frame_index, shared)).collect();
+        NewKeyframe { id: keyframe.frame_index, world_from_camera, seen, covisible, image_only: false }
     }
 
-    fn record(&mut self, frame: &ExtractedFrame, reference: usize, camera_from_reference: Se3) {
-        self.records.push(Record { frame_index: frame.index, timestamp_s: frame.timestamp_s, reference, camera_from_reference });
+    fn record(&mut self, frame: &ExtractedFrame, reference: usize, camera_from_reference: Se3, sightings: Sightings) {
+        let (frame_index, timestamp_s) = (frame.index, frame.timestamp_s);
+        self.records.push(Record { frame_index, timestamp_s, reference, camera_from_reference, sightings });
     }
 }
 

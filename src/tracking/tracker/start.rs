@@ -1,6 +1,7 @@
 //! How a submap begins: with one frame where there is depth, else with two.
 
-use super::{Lostness, Motion, Record, Tracker};
+use super::frames::{Record, Sightings};
+use super::{Lostness, Motion, Tracker};
 use crate::geometry::Se3;
 use crate::tracking::front_end::ExtractedFrame;
 use crate::tracking::initialisation::mono::{self, FirstView, SecondView};
@@ -22,7 +23,7 @@ impl Tracker {
         let keyframe = Keyframe { root: self.map.keyframes.len(), ..keyframe };
         let id = insertion::insert_keyframe(&mut self.map, keyframe, &self.rig);
         let landmarks = self.map.keyframes[id].landmarks.clone();
-        self.record(frame, id, Se3::identity());
+        self.record(frame, id, Se3::identity(), Sightings::default());
         let started = self.started(LastFrame { features, camera_from_world, landmarks }, id, times);
         TrackedFrame { inliers: with_depth, ..started }
     }
@@ -44,7 +45,8 @@ impl Tracker {
         self.map.append(submap, &self.next_submap(), &self.rig.config);
         for reference in [first, second] {
             let Keyframe { frame_index, timestamp_s, .. } = self.map.keyframes[reference];
-            self.records.push(Record { frame_index, timestamp_s, reference, camera_from_reference: Se3::identity() });
+            let (camera_from_reference, sightings) = (Se3::identity(), Sightings::default());
+            self.records.push(Record { frame_index, timestamp_s, reference, camera_from_reference, sightings });
         }
         let Keyframe { camera_from_world, ref landmarks, .. } = self.map.keyframes[second];
         let (inliers, landmarks) = (landmarks.iter().flatten().count(), landmarks.clone());
@@ -55,6 +57,7 @@ impl Tracker {
     /// The frame that completes a start, which is keyframe `id`.
     fn started(&mut self, last: LastFrame, id: usize, times: StageTimes) -> TrackedFrame {
         let world_from_camera = Some(last.camera_from_world.inverse());
+        self.note_mapped();
         self.first_view = None;
         self.motion = Motion { last: Some(last), velocity: None, reference: id };
         let frames_since_found = if self.lostness.is_lost { 0 } else { self.lostness.frames_since_found };

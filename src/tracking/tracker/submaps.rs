@@ -10,6 +10,7 @@ use super::Tracker;
 use crate::geometry::Se3;
 use crate::sequence::Sensor;
 use crate::tracking::front_end::ExtractedFrame;
+use crate::tracking::map::sparse_map::Keyframe;
 use crate::tracking::{StageTimes, TrackedFrame, TrackingError};
 
 /// Seconds without a pose after which a new submap begins.
@@ -47,10 +48,14 @@ impl Tracker {
         Se3::translation(furthest.map_or(0.0, apart), 0.0, 0.0)
     }
 
-    /// Keyframes of submaps that did not join the largest one.
+    /// Keyframes of submaps that did not join the largest one, image-only ones included, ascending.
     pub fn unjoined_keyframes(&self) -> Vec<usize> {
         let largest = self.largest_submap();
-        (0..self.map.keyframes.len()).filter(|k| self.map.keyframes[*k].root != largest).collect()
+        let apart = |k: &Keyframe| k.root != largest;
+        let mut keyframes: Vec<usize> = self.map.keyframes.iter().filter(|k| apart(k)).map(|k| k.frame_index).collect();
+        keyframes.extend(self.image_only_where(apart).iter().map(|k| k.frame_index));
+        keyframes.sort_unstable();
+        keyframes
     }
 
     /// The first keyframe of the submap in which most frames have their poses; of equals the oldest.

@@ -7,7 +7,7 @@
 mod path;
 mod world;
 
-use std::collections::BTreeMap;
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use clap::ValueEnum;
@@ -99,8 +99,8 @@ impl World {
 
     /// How many loops of a walk are wrong: their relative pose is off by more than a tenth of a hall. `truth` has a pose for each frame.
     pub fn wrong_loops(self, tracker: &Tracker, truth: &Trajectory) -> usize {
-        let frames: BTreeMap<usize, usize> = tracker.keyframes().iter().map(|k| (k.id, k.frame_index)).collect();
-        let true_pose = |id: usize| Some(truth.poses[*frames.get(&id)?].world_from_camera);
+        let frames: BTreeSet<usize> = tracker.keyframes().iter().map(|k| k.frame_index).collect();
+        let true_pose = |frame: usize| frames.contains(&frame).then(|| truth.poses[frame].world_from_camera);
         let is_wrong = |l: &&ClosedLoop| {
             // Keyframes of submaps that never joined are left out.
             let Some((keyframe, place)) = true_pose(l.keyframe).zip(true_pose(l.place)) else { return false };

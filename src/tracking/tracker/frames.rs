@@ -1,0 +1,227 @@
+//! Frames between keyframes: which of them become image-only keyframes, and their poses once the landmarks that they saw have settled.
+//!
+//! The tracker carries a frame by its reference keyframe. Bundle adjustment moves keyframe and landmarks in different ways; the pose is therefore
+//! solved once more when it is over with both.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use nalgebra::Vector2;
+
+use super::{Tracker, keyframe_selection};
+use crate::geometry::Se3;
+use crate::tracking::features::frame_features::FrameFeatures;
+use crate::tracking::map::sparse_map::{Keyframe, Map};
+use crate::tracking::rig::Rig;
+use crate::tracking::solvers::pose::{PoseObservation, optimise_pose};
+use crate::tracking::solvers::residual::Measurement;
+use crate::tracking::{KeyframePose, NewKeyframe};
+
+/// Keyframes after a frame's reference until its pose is solved again.
+const SETTLED_AFTER: usize = 12;
+/// Share of the landmarks that must still be there, and agree.
+const LEAST_AGREEING: f64 = 0.5;
+
+/// A tracked frame, held by its reference keyframe.
+#[derive(Clone, Debug)]
+pub(super) struct Record {
+    pub frame_index: usize,
+    pub timestamp_s: f64,
+    pub reference: usize,
+    /// In the reference keyframe's unit of length.
+    pub camera_from_reference: Se3,
+    /// Until its pose is solved again.
+    pub sightings: Sightings,
+}
+
+/// Landmarks that a frame saw.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Sightings {
+    seen: Vec<Sighting>,
+    /// How many keyframes there were: later landmarks may have taken the places of these.
+    known: usize,
+}
+
+/// A landmark where a frame saw it.
+#[derive(Clone, Copy, Debug)]
+struct Sighting {
+    landmark: u32,
+    pixel: [f32; 2],
+    /// 1/metres; NaN without depth.
+    inverse_depth: f32,
+    /// Inverse standard deviations of pixel and inverse depth.
+    weights: [f32; 2],
+}
+
+/// What is kept of frames between keyframes.
+#[derive(Debug, Default)]
+pub(super) struct Frames {
+    /// Records before this one have their final poses.
+    settled: usize,
+    /// The record of the last keyframe, image-only or not.
+    mapped_last: Option<usize>,
+    /// Records of image-only keyframes by their references, ascending.
+    images: BTreeMap<usize, Vec<usize>>,
+    /// Those whose poses were solved again since the last update.
+    moved: BTreeSet<usize>,
+}
+
+impl Sightings {
+    pub fn new(features: &FrameFeatures, landmarks: &[Option<usize>], map: &Map, rig: &Rig) -> Self {
+        let seen = features.features.iter().zip(landmarks).filter_map(|(feature, landmark)| {
+            let measured = feature.measurement(&rig.config);
+            Some(Sighting {
+                landmark: u32::try_from((*landmark)?).ok()?,
+                pixel: [measured.pixel.x as f32, measured.pixel.y as f32],
+                inverse_depth: measured.inverse_depth.map_or(f32::NAN, |inverse| inverse as f32),
+                weights: [measured.pixel_weight as f32, measured.depth_weight as f32],
+            })
+        });
+        Self { seen: seen.collect(), known: map.keyframes.len() }
+    }
+
+    /// Those whose landmarks are still there.
+    fn observations(&self, map: &Map, rig: &Rig) -> Vec<PoseObservation> {
+        let observation = |s: &Sighting| {
+            let landmark = map.resolve(s.landmark as usize).filter(|landmark| map.is_alive_since(*landmark, self.known))?;
+            let measured = Measurement {
+                pixel: Vector2::from(s.pixel.map(f64::from)),
+                inverse_depth: (!s.inverse_depth.is_nan()).then_some(s.inverse_depth.into()),
+                pixel_weight: s.weights[0].into(),
+                depth_weight: s.weights[1].into(),
+            };
+            let measurement = measured.without_bias(&rig.pinhole, &rig.depth_bias);
+            Some(PoseObservation { point_in_world: map.position(landmark), measurement })
+        };
+        self.seen.iter().filter_map(observation).collect()
+    }
+}
+
+impl Record {
+    /// camera_from_world.
+    pub fn pose(&self, map: &Map) -> Se3 {
+        map.keyframes[self.reference].carry(&self.camera_from_reference)
+    }
+
+    fn keyframe_pose(&self, map: &Map) -> KeyframePose {
+        KeyframePose { frame_index: self.frame_index, timestamp_s: self.timestamp_s, world_from_camera: self.pose(map).inverse() }
+    }
+
+    /// Solves the pose by the landmarks as they are now; `false` where too few are left or agree.
+    fn settle(&mut self, map: &Map, rig: &Rig) -> bool {
+        let sightings = std::mem::take(&mut self.sightings);
+        let found = optimise_pose(&rig.pinhole, &self.pose(map), &sightings.observations(map, rig));
+        let needed = (LEAST_AGREEING * sightings.seen.len() as f64).max(rig.config.min_inliers as f64);
+        let agrees = found.inliers as f64 >= needed;
+        if agrees {
+            self.camera_from_reference = map.keyframes[self.reference].relative(&found.camera_from_world);
+        }
+        agrees
+    }
+}
+
+impl Frames {
+    /// Records of image-only keyframes whose reference is this one, ascending.
+    pub fn images_of(&self, keyframe: usize) -> &[usize] {
+        self.images.get(&keyframe).map_or(&[], Vec::as_slice)
+    }
+
+    /// Those whose poses were solved again since the last call.
+    pub fn take_moved(&mut self) -> BTreeSet<usize> {
+        std::mem::take(&mut self.moved)
+    }
+}
+
+impl Tracker {
+    /// Notes that the newest record is a keyframe's.
+    pub(super) fn note_mapped(&mut self) {
+        self.frames.mapped_last = self.records.len().checked_sub(1);
+    }
+
+    /// Whether the frame tracked last, which is no keyframe, is worth an image-only one; `motion` is its motion since a pose as a share of what a
+    /// keyframe needs.
+    pub(super) fn is_image_due(&self, motion: impl FnOnce(&Se3) -> f64) -> bool {
+        let (Some(last), Some(record)) = (self.frames.mapped_last, self.records.last()) else { return false };
+        let last = &self.records[last];
+        let since_s = record.timestamp_s - last.timestamp_s;
+        keyframe_selection::is_image_due(since_s, motion(&last.pose(&self.map)), &self.rig.config)
+    }
+
+    /// Makes the frame tracked last an image-only keyframe.
+    pub(super) fn make_image_only(&mut self) -> Option<NewKeyframe> {
+        self.note_mapped();
+        let newest = self.frames.mapped_last?;
+        let record = &self.records[newest];
+        self.frames.images.entry(record.reference).or_default().push(newest);
+        let KeyframePose { frame_index, world_from_camera, .. } = record.keyframe_pose(&self.map);
+        Some(NewKeyframe { id: frame_index, world_from_camera, seen: Vec::new(), covisible: Vec::new(), image_only: true })
+    }
+
+    /// Solves the poses of frames whose landmarks bundle adjustment has left behind.
+    pub(super) fn settle_old_frames(&mut self) {
+        self.settle_frames(self.map.keyframes.len().saturating_sub(SETTLED_AFTER));
+    }
+
+    /// Solves the poses of frames whose reference came before keyframe `end`.
+    pub(super) fn settle_frames(&mut self, end: usize) {
+        while let Some(record) = self.records.get_mut(self.frames.settled).filter(|record| record.reference < end) {
+            let is_keyframe = self.map.keyframes[record.reference].frame_index == record.frame_index;
+            let moved = !is_keyframe && record.settle(&self.map, &self.rig);
+            if moved && self.frames.images_of(record.reference).binary_search(&self.frames.settled).is_ok() {
+                self.frames.moved.insert(self.frames.settled);
+            }
+            self.frames.settled += 1;
+        }
+    }
+
+    /// The image-only keyframes of the largest submap with their current poses, in order.
+    pub fn image_only_keyframes(&self) -> Vec<KeyframePose> {
+        let largest = self.largest_submap();
+        self.image_only_where(|keyframe| keyframe.root == largest)
+    }
+
+    /// The image-only keyframes whose references fulfil a condition, in order.
+    pub(super) fn image_only_where(&self, fulfils: impl Fn(&Keyframe) -> bool) -> Vec<KeyframePose> {
+        let of = self.frames.images.iter().filter(|(reference, _)| fulfils(&self.map.keyframes[**reference]));
+        let mut records: Vec<usize> = of.flat_map(|(_, records)| records.iter().copied()).collect();
+        records.sort_unstable();
+        records.into_iter().map(|record| self.records[record].keyframe_pose(&self.map)).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::se3;
+    use crate::tracking::TrackingConfig;
+    use crate::tracking::loop_closing::tests::drifted;
+    use crate::tracking::solvers::residual::tests::PINHOLE;
+    use nalgebra::Vector6;
+
+    use crate::geometry::Sim3;
+
+    #[test]
+    fn a_frame_is_solved_again_by_the_landmarks_as_they_are() {
+        let (config, rig) = (TrackingConfig::default(), Rig::new(PINHOLE, TrackingConfig::default()));
+        let mut map = drifted(&Sim3::identity(), true, &config);
+        let keyframe = &map.keyframes[2];
+        let sightings = Sightings::new(&keyframe.features, &keyframe.landmarks, &map, &rig);
+        let off = se3::exp(&Vector6::new(0.01, -0.005, 0.01, 0.003, 0.002, -0.004));
+        let record = Record {
+            frame_index: 7,
+            timestamp_s: 0.7,
+            reference: 1,
+            camera_from_reference: map.keyframes[1].relative(&(off * keyframe.camera_from_world)),
+            sightings,
+        };
+        let truth = keyframe.camera_from_world;
+        let error = |record: &Record, map: &Map| se3::log(&(record.pose(map) * truth.inverse())).norm();
+        let mut solved = record.clone();
+        assert!(solved.settle(&map, &rig) && error(&solved, &map) < 0.2 * error(&record, &map), "{}", error(&solved, &map));
+        assert!(solved.sightings.seen.is_empty());
+        // Where most of the landmarks are gone, it stays with its reference.
+        let seen: Vec<usize> = map.keyframes[2].landmarks.iter().flatten().copied().collect();
+        seen.iter().skip(20).for_each(|landmark| map.remove_landmark(*landmark));
+        let mut left = record.clone();
+        assert!(!left.settle(&map, &rig) && error(&left, &map) == error(&record, &map));
+    }
+}
