@@ -118,7 +118,7 @@ fn image_only_keyframes_are_learnt_from_and_insert_nothing() {
     let before = mapper.download().unwrap();
     let dim = |id: usize| {
         let mut seen = Keyframe { image_only: true, ..keyframe(id, true) };
-        seen.image.color.pixels_mut().for_each(|pixel| pixel.0 = pixel.0.map(|value| value / 2));
+        seen.image.color.pixels_mut().for_each(|pixel| pixel.0 = pixel.0.map(|value| value / 8 * 5));
         seen
     };
     for id in 1..4 {
