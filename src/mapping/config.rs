@@ -164,7 +164,7 @@ impl Default for PointsConfig {
 pub struct RefineConfig {
     /// Steps over all keyframes that follow each keyframe, most over those that had few.
     pub steps_per_keyframe: usize,
-    /// Epochs after the last keyframe.
+    /// Steps after the last keyframe, for each keyframe that is not image-only. They draw from all, in shuffled epochs.
     pub final_epochs: usize,
     /// Least steps after the last keyframe, one view each, whatever the number of keyframes. Without steps and epochs the map stays as it is.
     pub steps: usize,
@@ -204,7 +204,7 @@ impl Default for RefineConfig {
     fn default() -> Self {
         Self {
             steps_per_keyframe: 12,
-            final_epochs: 9,
+            final_epochs: 7,
             steps: 0,
             seconds: None,
             density_every: 200,
