@@ -99,7 +99,8 @@ impl Follower<'_> {
         let sequence = self.recording.sequence();
         let rectifier = self.rectifiers.of(sequence.camera_of(frame.index));
         let mut image = rectifier.rectify(frame);
-        let (landmarks, mut depth_source) = (self.scene.landmarks(frame.index), DepthSource::Sensor);
+        let landmarks = if due == Due::Full { self.scene.landmarks(frame.index) } else { Vec::new() };
+        let mut depth_source = DepthSource::Sensor;
         if image.depth.is_none() && !landmarks.is_empty() {
             image.depth = Some(rectifier.sparse_depth(&landmarks));
             depth_source = DepthSource::Landmarks { right: right_image(&rectifier, sequence.sensor, frame) };

@@ -80,7 +80,7 @@ impl Tracker {
     pub fn finish(&mut self) -> Result<Vec<KeyframeUpdate>, TrackingError> {
         self.take_in_all()?;
         self.adjust_all();
-        self.settle_frames(self.map.keyframes.len());
+        self.settle_all_frames();
         Ok(self.updates())
     }
 
@@ -170,7 +170,6 @@ impl Tracker {
         self.rig.depth_bias = solved.bias().unwrap_or(self.rig.depth_bias);
         times.bundle_ms += milliseconds(clock);
         self.close_loops_and_cull(under_way.around, times);
-        self.settle_old_frames();
         self.follow_keyframe();
         self.begin_next(times)
     }

@@ -18,6 +18,10 @@ use crate::tracking::{KeyframePose, NewKeyframe};
 
 /// Keyframes after a frame's reference until its pose is solved again.
 const SETTLED_AFTER: usize = 12;
+/// At each frame so many are, so that none takes long.
+const SETTLED_A_FRAME: usize = 2;
+/// Frames that may wait for it: a camera that stands still makes no keyframes.
+const MOST_WAITING: usize = 256;
 /// Share of the landmarks that must still be there, and agree.
 const LEAST_AGREEING: f64 = 0.5;
 
@@ -156,21 +160,33 @@ impl Tracker {
         Some(NewKeyframe { id: frame_index, world_from_camera, seen: Vec::new(), covisible: Vec::new(), image_only: true })
     }
 
-    /// Solves the poses of frames whose landmarks bundle adjustment has left behind.
+    /// Solves the poses of frames whose landmarks bundle adjustment has left behind, a few at a time.
     pub(super) fn settle_old_frames(&mut self) {
-        self.settle_frames(self.map.keyframes.len().saturating_sub(SETTLED_AFTER));
+        let end = self.map.keyframes.len().saturating_sub(SETTLED_AFTER);
+        for _ in 0..SETTLED_A_FRAME {
+            let is_old = self.records.get(self.frames.settled).is_some_and(|record| record.reference < end);
+            if is_old || self.records.len() > self.frames.settled + MOST_WAITING {
+                self.settle_next();
+            }
+        }
     }
 
-    /// Solves the poses of frames whose reference came before keyframe `end`.
-    pub(super) fn settle_frames(&mut self, end: usize) {
-        while let Some(record) = self.records.get_mut(self.frames.settled).filter(|record| record.reference < end) {
-            let is_keyframe = self.map.keyframes[record.reference].frame_index == record.frame_index;
-            let moved = !is_keyframe && record.settle(&self.map, &self.rig);
-            if moved && self.frames.images_of(record.reference).binary_search(&self.frames.settled).is_ok() {
-                self.frames.moved.insert(self.frames.settled);
-            }
-            self.frames.settled += 1;
+    /// Solves the poses of all frames that are left.
+    pub(super) fn settle_all_frames(&mut self) {
+        while self.frames.settled < self.records.len() {
+            self.settle_next();
         }
+    }
+
+    fn settle_next(&mut self) {
+        let settled = self.frames.settled;
+        let record = &mut self.records[settled];
+        let is_keyframe = self.map.keyframes[record.reference].frame_index == record.frame_index;
+        let moved = !is_keyframe && record.settle(&self.map, &self.rig);
+        if moved && self.frames.images_of(record.reference).binary_search(&settled).is_ok() {
+            self.frames.moved.insert(settled);
+        }
+        self.frames.settled += 1;
     }
 
     /// The image-only keyframes of the largest submap with their current poses, in order.
@@ -191,13 +207,12 @@ impl Tracker {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::se3;
+    use crate::geometry::{Camera, Distortion, Sim3, se3};
+    use crate::sequence::Sensor;
     use crate::tracking::TrackingConfig;
     use crate::tracking::loop_closing::tests::drifted;
     use crate::tracking::solvers::residual::tests::PINHOLE;
     use nalgebra::Vector6;
-
-    use crate::geometry::Sim3;
 
     #[test]
     fn a_frame_is_solved_again_by_the_landmarks_as_they_are() {
@@ -223,5 +238,24 @@ mod tests {
         seen.iter().skip(20).for_each(|landmark| map.remove_landmark(*landmark));
         let mut left = record.clone();
         assert!(!left.settle(&map, &rig) && error(&left, &map) == error(&record, &map));
+    }
+
+    #[test]
+    fn frames_of_a_camera_that_stands_still_do_not_wait_for_ever() {
+        let config = TrackingConfig::default();
+        let camera = Camera { pinhole: PINHOLE, distortion: Distortion::default(), depth_units_per_metre: 5000.0 };
+        let mut tracker = Tracker::new(camera, Sensor::Rgbd, &config).unwrap();
+        tracker.map = drifted(&Sim3::identity(), true, &config);
+        let newest = tracker.map.keyframes.len() - 1;
+        let Keyframe { features, landmarks, .. } = &tracker.map.keyframes[newest];
+        let sightings = Sightings::new(features, landmarks, &tracker.map, &tracker.rig);
+        assert!(!sightings.seen.is_empty());
+        for frame in 0..2 * MOST_WAITING {
+            let (frame_index, camera_from_reference, sightings) = (1000 + frame, Se3::identity(), sightings.clone());
+            tracker.records.push(Record { frame_index, timestamp_s: 0.1, reference: newest, camera_from_reference, sightings });
+            tracker.settle_old_frames();
+        }
+        let waiting = tracker.records.iter().filter(|record| !record.sightings.seen.is_empty());
+        assert_eq!(waiting.count(), MOST_WAITING);
     }
 }

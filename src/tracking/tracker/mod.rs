@@ -169,6 +169,9 @@ impl Tracker {
         let mut times = StageTimes { features_ms: frame.features_ms, ..StageTimes::default() };
         let adjusted = self.take_adjusted(&mut times)?;
         self.take_closed(adjusted, &mut times)?;
+        let clock = Instant::now();
+        self.settle_old_frames();
+        times.bundle_ms += milliseconds(clock);
         let mut tracked = match self.motion.last.take() {
             Some(last) => self.go_on(frame, last, may_be_keyframe, times)?,
             None if self.sensor == Sensor::Mono => self.start_without_depth(frame, may_be_keyframe, times),
