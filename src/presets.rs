@@ -17,7 +17,7 @@ use crate::render::BlendForm;
 pub enum Preset {
     /// Keep up with the recording's own frame rate: resolution and steps follow from the adapter's speed.
     Realtime,
-    /// Few steps: 3 a keyframe, and 6 epochs at the end.
+    /// Few steps: 3 a keyframe, and 4 epochs at the end.
     Draft,
     /// The defaults.
     Balanced,
@@ -59,7 +59,7 @@ impl Preset {
                 // With so few steps a keyframe's own are best kept for the end.
                 mapping.iterations_per_keyframe = 3;
                 mapping.refine.steps_per_keyframe = 0;
-                mapping.refine.final_epochs = 6;
+                mapping.refine.final_epochs = 4;
             }
             Self::Balanced => {}
             Self::Quality => refined(config, 20, 48),

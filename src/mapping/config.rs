@@ -203,8 +203,8 @@ impl RefineConfig {
 impl Default for RefineConfig {
     fn default() -> Self {
         Self {
-            steps_per_keyframe: 12,
-            final_epochs: 7,
+            steps_per_keyframe: 13,
+            final_epochs: 6,
             steps: 0,
             seconds: None,
             density_every: 200,
