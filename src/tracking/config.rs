@@ -52,7 +52,7 @@ pub struct TrackingConfig {
     pub keyframe_translation: f64,
     /// A keyframe is due after turning this far from the reference keyframe.
     pub keyframe_rotation_rad: f64,
-    /// Most image-only keyframes between two others, a second: the map learns from their images, and they hold no landmarks. 0: none.
+    /// Image-only keyframes a second, at most: frames between keyframes whose images the map learns from. 0: none.
     pub images_per_second: f64,
     /// Keyframes whose poses one bundle adjustment may move.
     pub window_keyframes: usize,
