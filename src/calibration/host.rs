@@ -12,7 +12,7 @@ use serde::Serialize;
 
 use crate::geometry::{Pinhole, Se3};
 use crate::gpu::Gpu;
-use crate::mapping::{DepthSource, HostTimes, Keyframe, Mapper, MappingConfig, MappingError};
+use crate::mapping::{HostTimes, Keyframe, Mapper, MappingConfig, MappingError};
 use crate::sequence::{DepthImage, KnownPoint, RectifiedImage};
 
 /// What to measure.
@@ -110,15 +110,7 @@ fn keyframe(id: usize, bench: &HostBench) -> Keyframe {
         valid: None,
     };
     let world_from_camera = Se3::translation(0.02 * id as f64, 0.0, 0.0);
-    Keyframe {
-        id,
-        world_from_camera,
-        image,
-        depth_source: DepthSource::Sensor,
-        covisible: (0..id).rev().take(5).collect(),
-        exposure: None,
-        image_only: false,
-    }
+    Keyframe { covisible: (0..id).rev().take(5).collect(), ..Keyframe::new(id, world_from_camera, image) }
 }
 
 fn points(bench: &HostBench) -> Vec<KnownPoint> {

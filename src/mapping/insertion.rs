@@ -189,7 +189,6 @@ fn interpolate(around: &[(f32, f32); 4]) -> f32 {
 
 #[cfg(test)]
 mod tests {
-    use super::super::DepthSource;
     use super::*;
     use crate::geometry::{Pinhole, Se3};
     use crate::sequence::RectifiedImage;
@@ -199,15 +198,7 @@ mod tests {
         let (width, height) = color.dimensions();
         let pinhole = Pinhole { fx: 30.0, fy: 30.0, cx: 15.5, cy: 11.5, width, height };
         let image = RectifiedImage { pinhole, color, depth: Some(DepthImage { width, height, metres }), valid: None };
-        Keyframe {
-            id: 0,
-            world_from_camera: Se3::identity(),
-            image,
-            depth_source: DepthSource::Sensor,
-            covisible: vec![],
-            exposure: None,
-            image_only: false,
-        }
+        Keyframe::new(0, Se3::identity(), image)
     }
 
     #[test]

@@ -39,6 +39,12 @@ pub struct Keyframe {
 }
 
 impl Keyframe {
+    /// A keyframe at a pose (world_from_camera), whose depth, if any, is measured, and whose exposure is not known yet.
+    pub fn new(id: KeyframeId, world_from_camera: Se3, image: RectifiedImage) -> Self {
+        let (depth_source, covisible) = (DepthSource::Sensor, Vec::new());
+        Self { id, world_from_camera, image, depth_source, covisible, exposure: None, image_only: false }
+    }
+
     /// At the tracker's pose.
     pub fn camera(&self) -> ViewCamera {
         ViewCamera { pinhole: self.image.pinhole, camera_from_world: self.world_from_camera.inverse() }

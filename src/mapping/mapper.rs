@@ -184,10 +184,7 @@ impl Mapper {
             (candidates.join().expect("the candidates are found"), survey)
         });
         let survey = survey?;
-        let exposure = self.timed("exposure", |mapper| mapper.exposure(&keyframe.image, survey.as_ref()));
-        if let Some(newest) = self.keyframes.last_mut() {
-            newest.exposure = exposure;
-        }
+        let exposure = self.expose(&keyframe, survey.as_ref());
         self.limit_gpu_images()?;
         let insert =
             |mapper: &mut Self, candidates| mapper.insert_gaussians(&keyframe, &candidates, (survey.as_ref(), &exposure));
@@ -210,15 +207,21 @@ impl Mapper {
     /// What follows an image-only keyframe: its exposure is measured. In real time, steps over all keyframes go on.
     fn follow_image(&mut self, keyframe: &Keyframe, interlude: &dyn Interlude) -> Result<KeyframeReport, MappingError> {
         let survey = self.timed("survey", |mapper| mapper.survey(false))?;
-        let exposure = self.timed("exposure", |mapper| mapper.exposure(&keyframe.image, survey.as_ref()));
-        if let Some(newest) = self.keyframes.last_mut() {
-            newest.exposure = exposure;
-        }
+        let exposure = self.expose(keyframe, survey.as_ref());
         self.limit_gpu_images()?;
         let taken = if self.config.yields_to_keyframes { self.consolidate_until(interlude)? } else { Taken::default() };
         let (iterations, psnr_db) = (taken.steps, taken.psnr_db());
         let report = KeyframeReport { id: keyframe.id, gaussians: self.gaussians(), exposure, ..KeyframeReport::default() };
         Ok(KeyframeReport { iterations, psnr_db, ..report })
+    }
+
+    /// Measures the exposure of the newest keyframe.
+    fn expose(&mut self, keyframe: &Keyframe, survey: Option<&Survey>) -> Exposure {
+        let exposure = self.timed("exposure", |mapper| mapper.exposure(&keyframe.image, survey));
+        if let Some(newest) = self.keyframes.last_mut() {
+            newest.exposure = exposure;
+        }
+        exposure
     }
 
     /// Number of keyframes that are not image-only.

@@ -332,22 +332,13 @@ mod tests {
 
     use super::*;
     use crate::geometry::{Pinhole, Se3};
-    use crate::mapping::{DepthSource, Keyframe};
+    use crate::mapping::Keyframe;
     use crate::sequence::RectifiedImage;
 
     fn keyframe(image_only: bool) -> MapperMessage {
         let pinhole = Pinhole { fx: 8.0, fy: 8.0, cx: 3.5, cy: 3.5, width: 8, height: 8 };
         let image = RectifiedImage { pinhole, color: RgbImage::new(8, 8), depth: None, valid: None };
-        let world_from_camera = Se3::identity();
-        let keyframe = Keyframe {
-            id: 0,
-            world_from_camera,
-            image,
-            depth_source: DepthSource::Sensor,
-            covisible: Vec::new(),
-            exposure: None,
-            image_only,
-        };
+        let keyframe = Keyframe { image_only, ..Keyframe::new(0, Se3::identity(), image) };
         MapperMessage::Keyframe(Box::new(keyframe))
     }
 

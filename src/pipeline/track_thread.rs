@@ -283,15 +283,7 @@ mod tests {
         let depth = DepthImage { width: 8, height: 8, metres: vec![2.0; 64] };
         let image = RectifiedImage { pinhole, color: RgbImage::new(8, 8), depth: Some(depth), valid: None };
         let depth_source = DepthSource::Landmarks { right: None };
-        let keyframe = Keyframe {
-            id,
-            world_from_camera: Se3::identity(),
-            image,
-            depth_source,
-            covisible: Vec::new(),
-            exposure: None,
-            image_only,
-        };
+        let keyframe = Keyframe { depth_source, image_only, ..Keyframe::new(id, Se3::identity(), image) };
         MapperMessage::Keyframe(Box::new(keyframe))
     }
 

@@ -30,7 +30,7 @@ pub use loop_closing::ClosedLoop;
 pub use self_calibration::{SelfCalibration, SelfCalibrationError, self_calibrate};
 pub use solvers::depth_bias::DepthBias;
 pub use tracker::Tracker;
-pub(crate) use tracker::keyframe_selection::is_image_due;
+pub(crate) use tracker::is_image_due;
 
 use nalgebra::Vector2;
 use serde::{Deserialize, Serialize};

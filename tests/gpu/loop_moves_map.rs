@@ -16,15 +16,7 @@ fn keyframe(id: usize, world_from_camera: Se3) -> Keyframe {
     let color = RgbImage::from_fn(width, height, |x, y| Rgb([(x * 3) as u8, (y * 4) as u8, ((x / 6 + y / 6) % 2 * 200) as u8]));
     let metres = (0..width * height).map(|i| 2.0 + 0.01 * (i % width) as f32).collect();
     let image = RectifiedImage { pinhole: PINHOLE, color, depth: Some(DepthImage { width, height, metres }), valid: None };
-    Keyframe {
-        id,
-        world_from_camera,
-        image,
-        depth_source: DepthSource::Sensor,
-        covisible: Vec::new(),
-        exposure: None,
-        image_only: false,
-    }
+    Keyframe::new(id, world_from_camera, image)
 }
 
 fn view(mapper: &mut Mapper, world_from_camera: &Se3) -> Rendered {

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use image::{Rgb, RgbImage};
 use keysplat::geometry::{Pinhole, Se3};
-use keysplat::mapping::{DepthSource, InitialMap, Keyframe, KeyframeReport, Mapper, MapperState, MappingConfig, PoseUpdate};
+use keysplat::mapping::{InitialMap, Keyframe, KeyframeReport, Mapper, MapperState, MappingConfig, PoseUpdate};
 use keysplat::sequence::{DepthImage, RectifiedImage};
 use keysplat::splat::{Exposure, Gaussian, unit_rotation};
 
@@ -17,15 +17,7 @@ pub fn keyframe(id: usize, with_depth: bool) -> Keyframe {
     let depth = with_depth.then(|| DepthImage { width, height, metres: vec![2.0; (width * height) as usize] });
     let image = RectifiedImage { pinhole: PINHOLE, color, depth, valid: None };
     let world_from_camera = Se3::translation(0.01 * id as f64, 0.0, 0.0);
-    Keyframe {
-        id,
-        world_from_camera,
-        image,
-        depth_source: DepthSource::Sensor,
-        covisible: Vec::new(),
-        exposure: None,
-        image_only: false,
-    }
+    Keyframe::new(id, world_from_camera, image)
 }
 
 #[test]

@@ -34,12 +34,6 @@ struct Known {
     distance: f64,
 }
 
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Due {
-    Full,
-    ImageOnly,
-}
-
 struct Follower<'a> {
     recording: &'a Recording,
     scene: &'a Scene<'a>,
@@ -63,24 +57,23 @@ impl Follower<'_> {
         self.scene.refined().map_or_else(known, of_run)
     }
 
-    /// Whether a frame becomes a keyframe, and which.
-    fn due(&self, frame: &Frame, world_from_camera: &Se3) -> Option<Due> {
-        let due = |image_only| if image_only { Due::ImageOnly } else { Due::Full };
+    /// Whether the keyframe that a frame becomes is image-only; `None` if it becomes none.
+    fn image_only(&self, frame: &Frame, world_from_camera: &Se3) -> Option<bool> {
         if let Some(refined) = self.scene.refined() {
-            return refined.keyframes.get(&frame.index).map(|keyframe| due(keyframe.image_only));
+            return refined.keyframes.get(&frame.index).map(|keyframe| keyframe.image_only);
         }
         if self.recording.config().replay.is_held_out(frame.index) {
             return None;
         }
         let photos = self.recording.sequence().layout.is_photos();
-        let Some(last) = self.keyframes.last().filter(|_| !photos) else { return Some(Due::Full) };
+        let Some(last) = self.keyframes.last().filter(|_| !photos) else { return Some(false) };
         if self.apart(last, world_from_camera) >= 1.0 {
-            return Some(Due::Full);
+            return Some(false);
         }
         let newest = self.images.last().filter(|image| image.frame_index > last.pose.frame_index).unwrap_or(&last.pose);
         let motion = self.apart(&Known { pose: *newest, distance: last.distance }, world_from_camera);
         let since_s = frame.timestamp_s - newest.timestamp_s;
-        is_image_due(since_s, motion, &self.recording.config().tracking).then_some(Due::ImageOnly)
+        is_image_due(since_s, motion, &self.recording.config().tracking).then_some(true)
     }
 
     /// The nearest keyframes, nearest first.
@@ -95,11 +88,11 @@ impl Follower<'_> {
         KeyframePoses { keyframes: self.keyframes.iter().map(|known| known.pose).collect(), loops: Vec::new() }
     }
 
-    fn make_keyframe(&mut self, frame: &Frame, world_from_camera: Se3, due: Due) -> Keyframe {
+    fn make_keyframe(&mut self, frame: &Frame, world_from_camera: Se3, image_only: bool) -> Keyframe {
         let sequence = self.recording.sequence();
         let rectifier = self.rectifiers.of(sequence.camera_of(frame.index));
         let mut image = rectifier.rectify(frame);
-        let landmarks = if due == Due::Full { self.scene.landmarks(frame.index) } else { Vec::new() };
+        let landmarks = if image_only { Vec::new() } else { self.scene.landmarks(frame.index) };
         let mut depth_source = DepthSource::Sensor;
         if image.depth.is_none() && !landmarks.is_empty() {
             image.depth = Some(rectifier.sparse_depth(&landmarks));
@@ -108,15 +101,16 @@ impl Follower<'_> {
         let covisible = self.covisible(&world_from_camera);
         let pose = KeyframePose { frame_index: frame.index, timestamp_s: frame.timestamp_s, world_from_camera };
         let distance = image.median_depth_metres().unwrap_or_else(|| self.scene.distance());
-        match due {
-            Due::Full => self.keyframes.push(Known { pose, distance }),
-            Due::ImageOnly => self.images.push(pose),
+        if image_only {
+            self.images.push(pose);
+        } else {
+            self.keyframes.push(Known { pose, distance });
         }
         let refined = self.scene.refined().and_then(|refined| refined.keyframes.get(&frame.index));
         if let Some(valid) = refined.and_then(|keyframe| keyframe.valid.as_ref()) {
             image.restrict(valid);
         }
-        let (exposure, image_only) = (refined.map(|keyframe| keyframe.exposure), due == Due::ImageOnly);
+        let exposure = refined.map(|keyframe| keyframe.exposure);
         Keyframe { id: frame.index, world_from_camera, image, depth_source, covisible, exposure, image_only }
     }
 }
@@ -148,8 +142,8 @@ pub(super) fn follow(thread: &TrackThread<'_>, scene: &Scene<'_>) -> TrackSummar
             if scene.refined().is_none() {
                 summary.trajectory.push((frame.index, StampedPose { timestamp_s: frame.timestamp_s, world_from_camera }));
             }
-            if let Some(due) = follower.due(&frame, &world_from_camera) {
-                keyframe = Some(guarded("tracking", || Ok(follower.make_keyframe(&frame, world_from_camera, due))));
+            if let Some(image_only) = follower.image_only(&frame, &world_from_camera) {
+                keyframe = Some(guarded("tracking", || Ok(follower.make_keyframe(&frame, world_from_camera, image_only))));
             }
         }
         let times = StageTimes { features_ms: started.elapsed().as_secs_f64() * 1e3, ..StageTimes::default() };

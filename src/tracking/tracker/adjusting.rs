@@ -277,7 +277,7 @@ impl Tracker {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::*;
     use crate::geometry::sim3::{self, Vector7};
     use crate::geometry::{Camera, Distortion, Sim3, se3};
@@ -286,12 +286,17 @@ mod tests {
     use crate::tracking::solvers::residual::tests::PINHOLE;
     use nalgebra::Vector6;
 
-    #[test]
-    fn the_end_adjusts_all_keyframes_together() {
+    /// A tracker whose map drifts by a step from keyframe to keyframe.
+    pub fn tracker(sensor: Sensor, step: &Sim3) -> Tracker {
         let config = TrackingConfig::default();
         let camera = Camera { pinhole: PINHOLE, distortion: Distortion::default(), depth_units_per_metre: 5000.0 };
-        let mut tracker = Tracker::new(camera, Sensor::Rgbd, &config).unwrap();
-        tracker.map = drifted(&Sim3::identity(), true, &config);
+        let map = drifted(step, sensor != Sensor::Mono, &config);
+        Tracker { map, ..Tracker::new(camera, sensor, &config).unwrap() }
+    }
+
+    #[test]
+    fn the_end_adjusts_all_keyframes_together() {
+        let mut tracker = tracker(Sensor::Rgbd, &Sim3::identity());
         tracker.frames_seen = 1;
         let truth: Vec<Se3> = tracker.map.keyframes.iter().map(|k| k.camera_from_world).collect();
         for (k, pose) in truth.iter().enumerate().skip(1) {
@@ -312,11 +317,8 @@ mod tests {
 
     #[test]
     fn the_scale_of_a_loop_without_depth_goes_out_with_the_poses() {
-        let config = TrackingConfig::default();
         let step = sim3::exp(&Vector7::from_column_slice(&[0.004, 0.001, -0.003, 0.001, 0.003, 0.0005, 0.004]));
-        let camera = Camera { pinhole: PINHOLE, distortion: Distortion::default(), depth_units_per_metre: 5000.0 };
-        let mut tracker = Tracker::new(camera, Sensor::Mono, &config).unwrap();
-        tracker.map = drifted(&step, false, &config);
+        let mut tracker = tracker(Sensor::Mono, &step);
         let newest = tracker.map.keyframes.len() - 1;
         // Landmarks of each keyframe that it saw first, and their depths, metres.
         let depths = |tracker: &Tracker| -> Vec<Vec<(usize, f64)>> {

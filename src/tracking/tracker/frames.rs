@@ -207,17 +207,14 @@ impl Tracker {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::{Camera, Distortion, Sim3, se3};
+    use crate::geometry::{Sim3, se3};
     use crate::sequence::Sensor;
-    use crate::tracking::TrackingConfig;
-    use crate::tracking::loop_closing::tests::drifted;
-    use crate::tracking::solvers::residual::tests::PINHOLE;
+    use crate::tracking::tracker::adjusting::tests::tracker;
     use nalgebra::Vector6;
 
     #[test]
     fn a_frame_is_solved_again_by_the_landmarks_as_they_are() {
-        let (config, rig) = (TrackingConfig::default(), Rig::new(PINHOLE, TrackingConfig::default()));
-        let mut map = drifted(&Sim3::identity(), true, &config);
+        let Tracker { rig, mut map, .. } = tracker(Sensor::Rgbd, &Sim3::identity());
         let keyframe = &map.keyframes[2];
         let sightings = Sightings::new(&keyframe.features, &keyframe.landmarks, &map, &rig);
         let off = se3::exp(&Vector6::new(0.01, -0.005, 0.01, 0.003, 0.002, -0.004));
@@ -242,10 +239,7 @@ mod tests {
 
     #[test]
     fn frames_of_a_camera_that_stands_still_do_not_wait_for_ever() {
-        let config = TrackingConfig::default();
-        let camera = Camera { pinhole: PINHOLE, distortion: Distortion::default(), depth_units_per_metre: 5000.0 };
-        let mut tracker = Tracker::new(camera, Sensor::Rgbd, &config).unwrap();
-        tracker.map = drifted(&Sim3::identity(), true, &config);
+        let mut tracker = tracker(Sensor::Rgbd, &Sim3::identity());
         let newest = tracker.map.keyframes.len() - 1;
         let Keyframe { features, landmarks, .. } = &tracker.map.keyframes[newest];
         let sightings = Sightings::new(features, landmarks, &tracker.map, &tracker.rig);

@@ -7,7 +7,7 @@ mod adjusting;
 mod closing;
 mod dense_fallback;
 mod frames;
-pub mod keyframe_selection;
+mod keyframe_selection;
 mod start;
 mod submaps;
 
@@ -18,6 +18,7 @@ use std::time::Instant;
 use adjusting::Adjusting;
 use closing::Closing;
 use frames::{Frames, Record, Sightings};
+pub use keyframe_selection::is_image_due;
 
 use crate::geometry::{Camera, Se3, StampedPose};
 use crate::sequence::{Frame, Sensor};
