@@ -204,24 +204,15 @@ impl Mapper {
         Ok(KeyframeReport { id: keyframe.id, inserted, gaussians: self.gaussians(), exposure, ..report })
     }
 
-    /// What follows an image-only keyframe: its exposure is measured. In real time, steps over all keyframes go on.
+    /// What follows an image-only keyframe: in real time, steps over all keyframes go on.
     fn follow_image(&mut self, keyframe: &Keyframe, interlude: &dyn Interlude) -> Result<KeyframeReport, MappingError> {
-        let survey = self.timed("survey", |mapper| mapper.survey(false))?;
+        let survey = if self.is_measured() { self.timed("survey", |mapper| mapper.survey(false))? } else { None };
         let exposure = self.expose(keyframe, survey.as_ref());
         self.limit_gpu_images()?;
         let taken = if self.config.yields_to_keyframes { self.consolidate_until(interlude)? } else { Taken::default() };
         let (iterations, psnr_db) = (taken.steps, taken.psnr_db());
         let report = KeyframeReport { id: keyframe.id, gaussians: self.gaussians(), exposure, ..KeyframeReport::default() };
         Ok(KeyframeReport { iterations, psnr_db, ..report })
-    }
-
-    /// Measures the exposure of the newest keyframe.
-    fn expose(&mut self, keyframe: &Keyframe, survey: Option<&Survey>) -> Exposure {
-        let exposure = self.timed("exposure", |mapper| mapper.exposure(&keyframe.image, survey));
-        if let Some(newest) = self.keyframes.last_mut() {
-            newest.exposure = exposure;
-        }
-        exposure
     }
 
     /// Number of keyframes that are not image-only.

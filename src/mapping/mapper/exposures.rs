@@ -1,10 +1,14 @@
-//! Exposures of the keyframes: measured on arrival, and again in the final refinement where photos arrive before there is a map.
+//! Exposures of the keyframes: measured on arrival, and again in the final refinement where photos arrive before there is a map. Most image-only
+//! keyframes take theirs from the measured ones around them.
 
 use super::{FinalRefinement, Mapper};
-use crate::mapping::{ExposureConfig, KeyframeId, MappingError, exposure};
+use crate::mapping::{ExposureConfig, Keyframe, KeyframeId, MappingError, exposure};
 use crate::optimise::Survey;
 use crate::sequence::RectifiedImage;
 use crate::splat::Exposure;
+
+/// Of image-only keyframes in a row, one in so many is measured.
+const MEASURED_EVERY: usize = 10;
 
 impl Mapper {
     /// Exposures of the keyframes against the map's, in the order of their arrival.
@@ -15,6 +19,38 @@ impl Mapper {
     /// Those of the image-only keyframes.
     pub fn image_exposures(&self) -> impl Iterator<Item = (KeyframeId, Exposure)> {
         self.keyframes.iter().filter(|keyframe| keyframe.image_only).map(|keyframe| (keyframe.id, keyframe.exposure))
+    }
+
+    /// Sets the exposure of the newest keyframe, and of those before it that have none of their own.
+    pub(super) fn expose(&mut self, keyframe: &Keyframe, survey: Option<&Survey>) -> Exposure {
+        let exposure = self.timed("exposure", |mapper| mapper.exposure(&keyframe.image, survey));
+        if self.is_measured() {
+            self.interpolate_exposures(&exposure);
+        }
+        if let Some(newest) = self.keyframes.last_mut() {
+            newest.exposure = exposure;
+        }
+        exposure
+    }
+
+    /// Whether the newest keyframe's exposure is measured; otherwise it has the last one until the next is.
+    pub(super) fn is_measured(&self) -> bool {
+        self.keyframes.last().is_some_and(|newest| !newest.image_only) || self.unmeasured() + 1 == MEASURED_EVERY
+    }
+
+    /// Keyframes before the newest one that came since the last measurement.
+    fn unmeasured(&self) -> usize {
+        self.keyframes.iter().rev().skip(1).take_while(|keyframe| keyframe.image_only).count() % MEASURED_EVERY
+    }
+
+    /// Those since the last measurement get exposures between that and the newest keyframe's, by their frames.
+    fn interpolate_exposures(&mut self, newest: &Exposure) {
+        let first = (self.keyframes.len() - 1).saturating_sub(self.unmeasured() + 1);
+        let [from, between @ .., to] = &mut self.keyframes[first..] else { return };
+        for keyframe in between {
+            let share = (keyframe.id - from.id) as f32 / (to.id - from.id) as f32;
+            keyframe.exposure = from.exposure.towards(newest, share);
+        }
     }
 
     /// The exposure of the newest keyframe's image, of which the map shows what was surveyed. A map that no step has moved yet shows nothing that counts.
