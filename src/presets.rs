@@ -17,7 +17,7 @@ use crate::render::BlendForm;
 pub enum Preset {
     /// Keep up with the recording's own frame rate: resolution and steps follow from the adapter's speed.
     Realtime,
-    /// Few steps: 3 a keyframe, and 4 epochs at the end.
+    /// Few steps: 2 a keyframe, and 4 epochs at the end.
     Draft,
     /// The defaults.
     Balanced,
@@ -57,9 +57,11 @@ impl Preset {
             }
             Self::Draft => {
                 // With so few steps a keyframe's own are best kept for the end.
-                mapping.iterations_per_keyframe = 3;
+                mapping.iterations_per_keyframe = 2;
                 mapping.refine.steps_per_keyframe = 0;
                 mapping.refine.final_epochs = 4;
+                // Nor has a short refinement time to settle.
+                (mapping.refine.final_lr_scale_position, mapping.refine.final_lr_scale) = (0.3, 0.4);
             }
             Self::Balanced => {}
             Self::Quality => refined(config, 20, 48),
