@@ -57,7 +57,7 @@ impl Preset {
             }
             Self::Draft => {
                 // With so few steps a keyframe's own are best kept for the end.
-                mapping.iterations_per_keyframe = 2;
+                (mapping.first_iterations, mapping.iterations_per_keyframe) = (5, 2);
                 mapping.refine.steps_per_keyframe = 0;
                 mapping.refine.final_epochs = 4;
                 // Nor has a short refinement time to settle.
