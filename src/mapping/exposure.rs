@@ -25,11 +25,13 @@ pub struct ExposureConfig {
     pub max_change: f32,
     /// Measurements of all keyframes' exposures during the first half of the final refinement. The map's own is then their mean.
     pub refinements: usize,
+    /// Of image-only keyframes in a row, one in so many is measured; the exposures of the others lie between.
+    pub measured_every: usize,
 }
 
 impl Default for ExposureConfig {
     fn default() -> Self {
-        Self { enabled: true, prior_share: 0.1, pull: 0.3, max_change: 0.7, refinements: 0 }
+        Self { enabled: true, prior_share: 0.1, pull: 0.5, max_change: 0.7, refinements: 0, measured_every: 1 }
     }
 }
 
@@ -42,6 +44,9 @@ impl ExposureConfig {
         let positive = |v: f32| v.is_finite() && v > 0.0;
         if !(positive(self.prior_share) && positive(self.max_change)) {
             return Err("prior_share and max_change must be positive".into());
+        }
+        if self.measured_every == 0 {
+            return Err("measured_every must be positive".into());
         }
         if (0.0..1.0).contains(&self.pull) { Ok(()) } else { Err("pull must lie between 0 and 1".into()) }
     }

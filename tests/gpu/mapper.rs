@@ -134,6 +134,34 @@ fn image_only_keyframes_are_learnt_from_and_insert_nothing() {
     assert_eq!(mapper.download().unwrap(), resumed.download().unwrap());
 }
 
+/// Of image-only keyframes in a row, one in so many is measured; the others lie between.
+#[test]
+fn exposures_of_image_only_keyframes_lie_between_measured_ones() {
+    let Some(gpu) = adapter() else { return };
+    let mut config = MappingConfig { first_iterations: 5, iterations_per_keyframe: 5, ..Default::default() };
+    config.exposure.measured_every = 4;
+    let mut mapper = Mapper::new(gpu, &config).unwrap();
+    let dim = |id: usize, image_only: bool| {
+        let mut seen = Keyframe { image_only, ..keyframe(id, true) };
+        seen.image.color.pixels_mut().for_each(|pixel| pixel.0 = pixel.0.map(|value| value / 8 * 5));
+        seen
+    };
+    mapper.insert(&keyframe(0, true), &|| false).unwrap();
+    // The fourth in a row is measured, and so is the keyframe at the end.
+    for id in 1..7 {
+        mapper.insert(&dim(id, true), &|| false).unwrap();
+    }
+    let red = |mapper: &Mapper| mapper.exposures().map(|(_, exposure)| exposure.0[0]).collect::<Vec<f32>>();
+    let before = red(&mapper);
+    assert!(before[4] < -0.1 && before[5..] == [before[4]; 2], "{before:?}");
+    mapper.insert(&dim(8, false), &|| false).unwrap();
+    let after = red(&mapper);
+    let between = |i: usize, low: usize, high: usize, share: f32| after[low] + share * (after[high] - after[low]) - after[i];
+    let off =
+        [between(1, 0, 4, 0.25), between(2, 0, 4, 0.5), between(3, 0, 4, 0.75), between(5, 4, 7, 0.25), between(6, 4, 7, 0.5)];
+    assert!(off.iter().all(|off| off.abs() < 1e-6) && after[..5] == before[..5], "{after:?}");
+}
+
 /// Steps that yield to keyframes go on over all keyframes until the next one waits.
 #[test]
 fn time_between_keyframes_goes_to_consolidation() {

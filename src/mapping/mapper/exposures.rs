@@ -1,14 +1,10 @@
-//! Exposures of the keyframes: measured on arrival, and again in the final refinement where photos arrive before there is a map. Most image-only
-//! keyframes take theirs from the measured ones around them.
+//! Exposures of the keyframes: measured on arrival, and again in the final refinement where photos arrive before there is a map.
 
 use super::{FinalRefinement, Mapper};
 use crate::mapping::{ExposureConfig, Keyframe, KeyframeId, MappingError, exposure};
 use crate::optimise::Survey;
 use crate::sequence::RectifiedImage;
 use crate::splat::Exposure;
-
-/// Of image-only keyframes in a row, one in so many is measured.
-const MEASURED_EVERY: usize = 10;
 
 impl Mapper {
     /// Exposures of the keyframes against the map's, in the order of their arrival.
@@ -35,12 +31,14 @@ impl Mapper {
 
     /// Whether the newest keyframe's exposure is measured; otherwise it has the last one until the next is.
     pub(super) fn is_measured(&self) -> bool {
-        self.keyframes.last().is_some_and(|newest| !newest.image_only) || self.unmeasured() + 1 == MEASURED_EVERY
+        self.keyframes.last().is_some_and(|newest| !newest.image_only)
+            || self.unmeasured() + 1 == self.config.exposure.measured_every
     }
 
     /// Keyframes before the newest one that came since the last measurement.
     fn unmeasured(&self) -> usize {
-        self.keyframes.iter().rev().skip(1).take_while(|keyframe| keyframe.image_only).count() % MEASURED_EVERY
+        self.keyframes.iter().rev().skip(1).take_while(|keyframe| keyframe.image_only).count()
+            % self.config.exposure.measured_every
     }
 
     /// Those since the last measurement get exposures between that and the newest keyframe's, by their frames.
