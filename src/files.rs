@@ -1,4 +1,6 @@
-//! Atomic file writes: the one way in which any output reaches the disk.
+//! Atomic file writes: the one way in which any output reaches the disk. Elements of PLY files.
+
+pub(crate) mod ply;
 
 use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};

@@ -12,7 +12,7 @@ const EVERYTHING_ABOVE: &[&str] = &["*"];
 const ALLOWED: [(&str, &[&str]); 28] = [
     ("files", &[]),
     ("geometry", &[]),
-    ("sequence", &["geometry"]),
+    ("sequence", &["files", "geometry"]),
     ("mesh", &["files", "geometry"]),
     ("synthetic", &["geometry", "mesh"]),
     ("splat", &["geometry"]),

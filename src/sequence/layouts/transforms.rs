@@ -7,20 +7,24 @@
 //!
 //! After nerfstudio, `mask_path` is an image whose black pixels are ignored, and `depth_file_path` a 16-bit image in units of
 //! `depth_unit_scale_factor`, a thousandth of the poses' unit by default. With one depth image the recording is RGB-D; frames without
-//! depth are then as those of a sensor that measured nothing.
+//! depth are then as those of a sensor that measured nothing. `ply_file_path` is a cloud of points in the poses' world.
 //!
-//! Left out: fisheye lenses, which are refused; point clouds, which are not read.
+//! Left out: fisheye lenses, which are refused.
 
 mod lens;
 
 use std::path::{Path, PathBuf};
 
+use glam::Vec3;
 use nalgebra::{UnitQuaternion, Vector3};
 use serde::Deserialize;
 
 use super::row::{LayoutRow, SAMPLE_SIZE, parse_text};
+use crate::files::ply::Vertices;
 use crate::geometry::{Camera, Se3, StampedPose, Trajectory};
-use crate::sequence::{FrameEntry, Sensor, Sequence, SequenceError, checks, existing, folder_name, parse_json, read_text};
+use crate::sequence::{
+    FrameEntry, KnownPoint, Sensor, Sequence, SequenceError, checks, existing, folder_name, parse_json, read_text,
+};
 use lens::Lens;
 
 const FILE: &str = "transforms.json";
@@ -81,7 +85,8 @@ fn open(folder: &Path) -> Result<Sequence, SequenceError> {
     let camera = entries.iter().find_map(|entry: &FrameEntry| entry.camera).ok_or_else(unreadable)?;
     let sensor = if entries.iter().any(|entry| entry.depth.is_some()) { Sensor::Rgbd } else { Sensor::Mono };
     let groundtruth = Some(Trajectory { poses });
-    let sequence = Sequence { groundtruth, ..Sequence::new(folder_name(folder), &LAYOUT, camera, sensor, entries) };
+    let points = file.ply_file_path.map_or(Ok(Vec::new()), |name| read_points(&folder.join(name)))?;
+    let sequence = Sequence { groundtruth, points, ..Sequence::new(folder_name(folder), &LAYOUT, camera, sensor, entries) };
     sequence.check_first_size()?;
     sequence.check_mask_and_depth_sizes()?;
     Ok(sequence)
@@ -91,6 +96,7 @@ fn open(folder: &Path) -> Result<Sequence, SequenceError> {
 struct Transforms {
     /// Poses' units per unit of depth.
     depth_unit: f64,
+    ply_file_path: Option<String>,
     photos: Vec<Photo>,
 }
 
@@ -119,13 +125,28 @@ impl Transforms {
         };
         let depth_unit = file.depth_unit_scale_factor.unwrap_or(DEPTH_UNIT);
         let photos = file.frames.into_iter().enumerate().map(photo).collect::<Result<_, SequenceError>>()?;
-        Ok(Self { depth_unit, photos })
+        Ok(Self { depth_unit, ply_file_path: file.ply_file_path, photos })
     }
 
     /// The camera of a photo of that size, if its lens does not say its own.
     fn camera(&self, photo: &Photo, size: (u32, u32)) -> Result<Camera, String> {
         photo.lens.camera(size, 1.0 / self.depth_unit)
     }
+}
+
+/// The points of a PLY file. One that is not there is no reason to refuse the photos, whose points can be triangulated.
+fn read_points(path: &Path) -> Result<Vec<KnownPoint>, SequenceError> {
+    let bytes = match std::fs::read(path) {
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => {
+            tracing::warn!("{} names the points in {}, which is missing", FILE, path.display());
+            return Ok(Vec::new());
+        }
+        read => read.map_err(|source| SequenceError::Read { path: path.into(), source })?,
+    };
+    let Vertices { positions, colors } =
+        Vertices::parse(&bytes).map_err(|what| SequenceError::Content { path: path.into(), what })?;
+    let point = |(position, color): (Vec3, [u8; 3])| KnownPoint { position: position.as_dvec3().to_array().into(), color };
+    Ok(positions.into_iter().zip(colors).map(point).collect())
 }
 
 /// The image that a path means.
@@ -141,6 +162,7 @@ struct TransformsFile {
     #[serde(flatten)]
     lens: Lens,
     depth_unit_scale_factor: Option<f64>,
+    ply_file_path: Option<String>,
     frames: Vec<ListedFrame>,
 }
 
@@ -235,6 +257,21 @@ mod tests {
         image::GrayImage::new(8, 7).save(image("masks/b.png")).unwrap();
         let message = open().unwrap_err();
         assert!(message.contains("masks/b.png is 8x7, but the camera is 8x6"), "{message}");
+    }
+
+    #[test]
+    fn points_are_read_where_the_file_names_them() {
+        let folder = recording(&format!("{LENS}, \"ply_file_path\": \"sparse_pc.ply\""), FRAMES);
+        let open = || Sequence::open(folder.path(), None, None).map_err(|error| error.to_string());
+        assert!(open().unwrap().points.is_empty());
+        let ply = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n\
+                   property uint8 red\nproperty uint8 green\nproperty uint8 blue\nend_header\n0.5 -1 2 255 0 7\n";
+        let file = folder.path().join("sparse_pc.ply");
+        std::fs::write(&file, ply).unwrap();
+        assert_eq!(open().unwrap().points, [KnownPoint { position: Vector3::new(0.5, -1.0, 2.0), color: [255, 0, 7] }]);
+        std::fs::write(&file, ply.replace("-1 2", "-1")).unwrap();
+        let message = open().unwrap_err();
+        assert!(message.contains("sparse_pc.ply") && message.contains("vertex 0 has 5 of 6 values"), "{message}");
     }
 
     #[test]
