@@ -31,7 +31,7 @@ pub(super) fn encode(mesh: &Mesh) -> Vec<u8> {
 pub(super) fn decode(bytes: &[u8]) -> Result<Mesh, String> {
     let header = Header::parse(bytes)?;
     if header.is_ascii {
-        return Err("ASCII is not supported".into());
+        return Err("`format ascii 1.0` is not supported".into());
     }
     let (Vertices { positions, colors }, faces) = Vertices::after(&header, bytes)?;
     let face = header.face.ok_or("it has no faces, so it is a map or a cloud of points")?;
