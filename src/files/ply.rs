@@ -173,50 +173,62 @@ impl Vertices {
     /// Those that follow a file's header, and the bytes behind them.
     pub fn after<'a>(header: &Header, bytes: &'a [u8]) -> Result<(Self, &'a [u8]), String> {
         let element = header.vertex.as_ref().ok_or("it has no vertices")?;
+        let columns = Columns::of(element)?;
         let body = &bytes[header.bytes..];
         let mut vertices = Self::default();
         if header.is_ascii {
             let text = std::str::from_utf8(body).map_err(|_| "it says that it is ASCII, and is not")?;
             let mut lines = text.lines().filter(|line| !line.trim().is_empty());
             for index in 0..element.count {
-                let line = lines.next().ok_or("it is cut off")?;
-                let numbers = line.split_whitespace().map(|word| word.parse().map_err(|_| format!("`{word}` is no number")));
-                let numbers: Vec<f64> =
-                    numbers.collect::<Result<_, String>>().map_err(|what| format!("vertex {index}: {what}"))?;
-                let missing = || format!("vertex {index} has {} of {} values", numbers.len(), element.properties.len());
-                (numbers.len() == element.properties.len()).then_some(()).ok_or_else(missing)?;
-                vertices.push(element, |property| numbers[property.index])?;
+                let numbers = numbers(lines.next().ok_or("it is cut off")?, element.properties.len());
+                let numbers = numbers.map_err(|what| format!("vertex {index} {what}"))?;
+                vertices.push(&columns, |property| numbers[property.index])?;
             }
             return Ok((vertices, &[]));
         }
         let size = element.count.checked_mul(element.stride).filter(|size| *size <= body.len()).ok_or("it is cut off")?;
         let (rows, rest) = body.split_at(size);
-        // An element without properties has no bytes, and lacks x.
-        for row in rows.chunks_exact(element.stride.max(1)) {
-            vertices.push(element, |property| property.kind.read(&row[property.offset..]))?;
-        }
-        if vertices.positions.is_empty() && element.count > 0 {
-            return Err("its vertices lack x, y or z".into());
+        for row in rows.chunks_exact(element.stride) {
+            vertices.push(&columns, |property| property.kind.read(&row[property.offset..]))?;
         }
         Ok((vertices, rest))
     }
 
-    fn push(&mut self, element: &Element, value: impl Fn(&Property) -> f64) -> Result<(), String> {
-        let find = |name: &str| element.properties.iter().find(|property| property.name == name);
-        let [Some(x), Some(y), Some(z)] = ["x", "y", "z"].map(find) else { return Err("its vertices lack x, y or z".into()) };
-        let p = Vec3::from([x, y, z].map(|property| value(property) as f32));
+    fn push(&mut self, columns: &Columns<'_>, value: impl Fn(&Property) -> f64) -> Result<(), String> {
+        let p = Vec3::from(columns.position.map(|property| value(property) as f32));
         if !(p.is_finite() && p.abs().max_element() <= MOST_COORDINATE) {
             let index = self.positions.len();
             return Err(format!("vertex {index} is not finite, or farther than 10,000 km from the origin"));
         }
         self.positions.push(p);
-        let color = ["red", "green", "blue"].map(|name| find(name).filter(|property| property.kind == Scalar::U8));
-        self.colors.push(match color {
-            [Some(r), Some(g), Some(b)] => [r, g, b].map(|property| value(property) as u8),
-            _ => GREY,
-        });
+        self.colors.push(columns.color.map_or(GREY, |color| color.map(|property| value(property) as u8)));
         Ok(())
     }
+}
+
+/// Where a vertex has its position and its colour.
+struct Columns<'a> {
+    position: [&'a Property; 3],
+    color: Option<[&'a Property; 3]>,
+}
+
+impl<'a> Columns<'a> {
+    fn of(vertex: &'a Element) -> Result<Self, String> {
+        let find = |name: &str| vertex.properties.iter().find(|property| property.name == name);
+        let [Some(x), Some(y), Some(z)] = ["x", "y", "z"].map(find) else { return Err("its vertices lack x, y or z".into()) };
+        let color = match ["red", "green", "blue"].map(|name| find(name).filter(|property| property.kind == Scalar::U8)) {
+            [Some(r), Some(g), Some(b)] => Some([r, g, b]),
+            _ => None,
+        };
+        Ok(Self { position: [x, y, z], color })
+    }
+}
+
+/// So many numbers in a line of text.
+fn numbers(line: &str, count: usize) -> Result<Vec<f64>, String> {
+    let parse = |word: &str| word.parse().map_err(|_| format!("has `{word}`, which is no number"));
+    let numbers = line.split_whitespace().map(parse).collect::<Result<Vec<f64>, String>>()?;
+    if numbers.len() == count { Ok(numbers) } else { Err(format!("has {} of {count} values", numbers.len())) }
 }
 
 #[cfg(test)]
@@ -242,7 +254,7 @@ mod tests {
         assert_eq!(Vertices::parse(&bytes).unwrap(), vertices);
         for (wrong, what) in [
             (text.replace(" 5 1 2 3", " 5 1 2"), "vertex 1 has 5 of 6 values"),
-            (text.replace("4e0", "four"), "vertex 1: `four` is no number"),
+            (text.replace("4e0", "four"), "vertex 1 has `four`, which is no number"),
             (text.replace("-1 2.25", "nan 2.25"), "vertex 0 is not finite"),
             (text.replace("vertex 2", "vertex 3"), "cut off"),
             (text.replace("float z", "float w"), "lack x, y or z"),
