@@ -73,6 +73,18 @@ fn outliers_are_found_and_do_not_pull() {
 }
 
 #[test]
+fn depths_from_behind_an_edge_hardly_pull() {
+    let (mut problem, truth) = scene(0.0, false);
+    for o in problem.observations.iter_mut().filter(|o| o.point % 7 == 0) {
+        // Three standard deviations.
+        o.measurement.inverse_depth = o.measurement.inverse_depth.map(|measured| measured - 0.03);
+    }
+    problem.solve(&PINHOLE, 50);
+    let error = worst_pose_error(&problem, &truth);
+    assert!(error < 1e-3, "{error}");
+}
+
+#[test]
 fn a_bias_of_the_depth_is_found() {
     let (mut problem, truth) = scene(0.0, false);
     let bias = DepthBias(Vector3::new(-0.004, 0.012, 0.02));

@@ -15,7 +15,10 @@ const CHI2_PIXEL: f64 = 5.991;
 /// Squared depth residuals beyond this are wrong: wide, for the tails of a depth sensor are heavy.
 const CHI2_DEPTH: f64 = 9.0;
 /// Squared depth residuals beyond this pull less and less.
-const HUBER_DEPTH: f64 = 1.0;
+///
+/// The standard deviation of depth is that of errors which a landmark's views share. A single depth varies by a fraction of it, and what varies more
+/// is mostly a surface behind an edge: always too far, never too near.
+const HUBER_DEPTH: f64 = 0.04;
 
 /// Points nearer than this to the camera's plane, or behind it, are not seen, metres.
 const NEAR_METRES: f64 = 1e-2;
