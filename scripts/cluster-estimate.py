@@ -64,8 +64,8 @@ def scene_table(step_s, visits_per_border, see_s, cores, storage, image, gaussia
     print("|---|---|---|---|---|---|")
     print(f"| 1, in one piece | {start_s + read:.0f} | {work:.0f} | {whole:.0f} | 1 | |")
     for gpus in GPUS:
-        # Each task verifies the whole recording, as many at a time as there are GPUs.
-        start = start_s + in_view * see + read * min(gpus, cells)
+        # Each task reads its own images, as many tasks at a time as there are GPUs. The plan has read the recording, which no task does again.
+        start = start_s + in_view * see + read * min(gpus, cells) * visits / cells
         time = serial + makespan([start + share * visits * work for share in shares(cells, imbalance)], gpus)
         print(f"| {gpus}, in cells | {start:.0f} | {visits * work:.0f} | {time:.0f} | {whole / time:.1f} | {serial / time:.0%} |")
 

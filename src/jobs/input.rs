@@ -1,8 +1,9 @@
 //! Digests of what tasks read, in the format of `sha256sum`: one line a file, so that the file that changed can be named.
 
-use std::fs::File;
+use std::fs::{File, Metadata};
 use std::io::Read;
 use std::path::{Path, PathBuf};
+use std::time::{Duration, SystemTime};
 
 use rayon::iter::{IntoParallelRefIterator, ParallelIterator};
 use serde::{Deserialize, Serialize};
@@ -10,10 +11,14 @@ use sha2::{Digest, Sha256};
 
 use super::JobError;
 use crate::evaluation::sha256_hex;
-use crate::files::write_durably;
+use crate::files::{write_atomically, write_durably};
 
 /// Folder of the digests in a plan.
 const INPUTS: &str = "inputs";
+/// Ending of the files' states at which the digests were found to be right.
+const SEEN: &str = "seen";
+/// File systems tell times in steps up to this long.
+const TIME_STEP: Duration = Duration::from_millis(if cfg!(test) { 20 } else { 2000 });
 /// Bytes read at a time.
 const CHUNK: usize = 1 << 20;
 
@@ -35,23 +40,32 @@ impl Input {
     /// # Errors
     /// If a file cannot be read, or the digests cannot be written.
     pub(super) fn measure(plan: &Path, path: PathBuf) -> Result<Self, JobError> {
+        let states = states(&plan.join(&path))?;
         let lines = lines(&plan.join(&path))?.concat();
         let sha256 = sha256_hex(lines.as_bytes());
         // Named by its content, so that no other plan's file is replaced.
         let digests = Path::new(INPUTS).join(format!("{}.sha256", &sha256[..16]));
         create_folder(&plan.join(INPUTS))?;
         write_durably(&plan.join(&digests), lines.as_bytes())?;
+        write_atomically(&plan.join(&digests).with_extension(SEEN), states.as_bytes())?;
         Ok(Self { path, digests, sha256 })
     }
 
-    /// Reads the input again and compares it.
+    /// Reads the input again and compares it, unless no file has changed since it was read last, by the plan or a task: a thousand tasks do not
+    /// read a recording a thousand times.
     ///
     /// # Errors
     /// Names the first file that differs, is missing or is new.
     pub(super) fn verify(&self, plan: &Path) -> Result<(), JobError> {
-        let path = plan.join(&self.path);
+        let (path, seen) = (plan.join(&self.path), plan.join(&self.digests).with_extension(SEEN));
+        let states = states(&path)?;
+        if std::fs::read_to_string(&seen).is_ok_and(|before| before == states) {
+            return Ok(());
+        }
         let now = lines(&path)?;
         if sha256_hex(now.concat().as_bytes()) == self.sha256 {
+            // Without it the next task reads them again.
+            let _ = write_atomically(&seen, states.as_bytes());
             return Ok(());
         }
         let listed = std::fs::read_to_string(plan.join(&self.digests)).unwrap_or_default();
@@ -67,6 +81,37 @@ impl Input {
 
 /// `digest  name` of each file, names relative to the folder and sorted.
 fn lines(path: &Path) -> Result<Vec<String>, JobError> {
+    of_files(path, sha256_of)
+}
+
+/// Size and time of the last change of each file: another digest has another state. A file that changed a moment ago may change again at the same
+/// time; its state never comes again.
+fn states(path: &Path) -> Result<String, JobError> {
+    let now = SystemTime::now();
+    let state = |file: &Path| {
+        let metadata = std::fs::metadata(file)?;
+        let changed = changed(&metadata);
+        let is_settled = now.duration_since(changed).is_ok_and(|age| age > TIME_STEP);
+        let since_epoch = |time: SystemTime| time.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default().as_nanos();
+        Ok(format!("{} {}", metadata.len(), since_epoch(if is_settled { changed } else { now })))
+    };
+    of_files(path, state).map(|lines| lines.concat())
+}
+
+/// When a file's content or metadata changed last. On Unix no program can set this back.
+fn changed(metadata: &Metadata) -> SystemTime {
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::MetadataExt;
+        let since_epoch = Duration::new(metadata.ctime().try_into().unwrap_or(0), metadata.ctime_nsec().try_into().unwrap_or(0));
+        SystemTime::UNIX_EPOCH + since_epoch
+    }
+    #[cfg(not(unix))]
+    metadata.modified().unwrap_or_else(|_| SystemTime::now())
+}
+
+/// `what  name` of each file, names relative to the folder and sorted.
+fn of_files(path: &Path, what: impl Fn(&Path) -> std::io::Result<String> + Sync) -> Result<Vec<String>, JobError> {
     let unreadable =
         |path: &Path, source: std::io::Error| JobError::Input { path: path.into(), reason: format!("cannot be read ({source})") };
     let metadata = std::fs::metadata(path).map_err(|error| unreadable(path, error))?;
@@ -76,7 +121,7 @@ fn lines(path: &Path) -> Result<Vec<String>, JobError> {
     files.sort();
     let line = |file: &PathBuf| {
         let name = file.strip_prefix(folder).unwrap_or(file).display();
-        Ok(format!("{}  {name}\n", sha256_of(file).map_err(|error| unreadable(file, error))?))
+        Ok(format!("{}  {name}\n", what(file).map_err(|error| unreadable(file, error))?))
     };
     files.par_iter().map(line).collect()
 }

@@ -125,6 +125,24 @@ fn a_changed_input_is_named_and_never_tried_again() {
 }
 
 #[test]
+fn inputs_are_read_again_only_after_a_change() {
+    let bench = Bench::new(1);
+    let (folder, input) = (bench.plan.folder(), &bench.plan.inputs[0]);
+    // Reading the files finds that they are not these.
+    let others = Input { sha256: "0".repeat(64), ..input.clone() };
+    let image = bench.file("recording/rgb/0.png");
+    std::fs::write(&image, b"one").unwrap();
+    assert!(others.verify(folder).is_err());
+    std::thread::sleep(std::time::Duration::from_millis(50));
+    input.verify(folder).unwrap();
+    others.verify(folder).unwrap();
+    std::fs::write(&image, b"One").unwrap();
+    assert!(input.verify(folder).unwrap_err().to_string().contains("rgb/0.png is not what it was"));
+    std::fs::write(&image, b"one").unwrap();
+    input.verify(folder).unwrap();
+}
+
+#[test]
 fn one_process_at_a_time_has_a_task() {
     let bench = Bench::new(1);
     std::fs::create_dir_all(bench.plan.task_folder(0)).unwrap();
