@@ -59,7 +59,7 @@ impl Preset {
                 // With so few steps a keyframe's own are best kept for the end.
                 (mapping.first_iterations, mapping.iterations_per_keyframe) = (5, 2);
                 mapping.refine.steps_per_keyframe = 0;
-                mapping.refine.final_epochs = 4;
+                mapping.refine.final_epochs = 5;
                 // A short refinement has no time to settle, or to learn what exposures leave to it.
                 (mapping.exposure.measured_every, mapping.exposure.pull) = (10, 0.4);
                 (mapping.refine.final_lr_scale_position, mapping.refine.final_lr_scale) = (0.3, 0.4);
