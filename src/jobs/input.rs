@@ -15,7 +15,7 @@ use crate::files::{write_atomically, write_durably};
 
 /// Folder of the digests in a plan.
 const INPUTS: &str = "inputs";
-/// Ending of the files' states at which the digests were found to be right.
+/// Ending of the file beside the digests that holds the files' states when they were last right.
 const SEEN: &str = "seen";
 /// File systems tell times in steps up to this long.
 const TIME_STEP: Duration = Duration::from_millis(if cfg!(test) { 20 } else { 2000 });
@@ -51,7 +51,7 @@ impl Input {
         Ok(Self { path, digests, sha256 })
     }
 
-    /// Reads the input again and compares it, unless no file has changed since it was read last, by the plan or a task: a thousand tasks do not
+    /// Compares the input with its digests. Reads it only where a file has changed since the plan or a task read it whole: a thousand tasks do not
     /// read a recording a thousand times.
     ///
     /// # Errors
@@ -98,7 +98,7 @@ fn states(path: &Path) -> Result<String, JobError> {
     of_files(path, state).map(|lines| lines.concat())
 }
 
-/// When a file's content or metadata changed last. On Unix no program can set this back.
+/// When a file's content or metadata changed last. On Unix it follows the clock alone; programs cannot set it.
 fn changed(metadata: &Metadata) -> SystemTime {
     #[cfg(unix)]
     {

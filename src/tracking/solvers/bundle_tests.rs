@@ -73,7 +73,7 @@ fn outliers_are_found_and_do_not_pull() {
 }
 
 #[test]
-fn depths_from_behind_an_edge_hardly_pull() {
+fn wrong_depths_hardly_pull() {
     let (mut problem, truth) = scene(0.0, false);
     for o in problem.observations.iter_mut().filter(|o| o.point % 7 == 0) {
         // Three standard deviations.

@@ -16,8 +16,8 @@ const CHI2_PIXEL: f64 = 5.991;
 const CHI2_DEPTH: f64 = 9.0;
 /// Squared depth residuals beyond this pull less and less.
 ///
-/// The standard deviation of depth is that of errors which a landmark's views share. A single depth varies by a fraction of it, and what varies more
-/// is mostly a surface behind an edge: always too far, never too near.
+/// A single depth varies by a fraction of the standard deviation, which covers errors that a landmark's views share. What varies more is often a surface
+/// behind an edge.
 const HUBER_DEPTH: f64 = 0.04;
 
 /// Points nearer than this to the camera's plane, or behind it, are not seen, metres.
