@@ -6,14 +6,13 @@ use crate::sequence::SensorKind;
 
 const FEATURES_RGBD: usize = 2000;
 const FEATURES_MONO: usize = 1500;
-const FEATURES_STEREO: usize = 1000;
+const FEATURES_STEREO: usize = 1500;
 
 /// Settings of the tracker.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TrackingConfig {
-    /// Features kept per frame, over all pyramid levels; by default 2000 with depth images, 1500 of a single camera and 1000 of a
-    /// stereo pair.
+    /// Features kept per frame, over all pyramid levels; by default 2000 with depth images, and 1500 of a single camera or a stereo pair.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub features: Option<usize>,
     /// Levels of the image pyramid.
@@ -33,7 +32,7 @@ pub struct TrackingConfig {
     /// Standard deviation of measured inverse depth, 1/metres. A structured-light sensor measures disparity with constant noise,
     /// so its depth noise grows as `inverse_depth_sigma * depth²`.
     pub inverse_depth_sigma: f64,
-    /// Whether a systematic error of depth images is estimated: a tilt of inverse depth over the image.
+    /// Whether a systematic error of measured depth is estimated: a tilt of a depth image's inverse depth over the image, or an offset of disparities.
     pub depth_bias: bool,
     /// Standard deviation of a stereo disparity at the finest pyramid level, pixels. Coarser levels scale it.
     pub disparity_sigma: f64,

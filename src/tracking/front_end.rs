@@ -11,9 +11,12 @@ use crate::geometry::Camera;
 use crate::sequence::{DepthImage, Frame, Sensor};
 use crate::tracking::features::frame_features::{Feature, FrameFeatures};
 use crate::tracking::features::orb::{Extractor, Keypoint};
-use crate::tracking::features::stereo::{Eye, disparities};
+use crate::tracking::features::stereo::disparities;
 use crate::tracking::localisation::dense_alignment::{DenseFrame, DenseSampler};
 use crate::tracking::{TrackingConfig, TrackingError};
+
+/// Nearest depth that a stereo pair measures, in baselines.
+const NEAREST_BASELINES: f64 = 2.0;
 
 /// Camera, sensor and ORB extractor.
 #[derive(Debug)]
@@ -122,14 +125,10 @@ impl FrontEnd {
     ) -> Result<(Vec<Keypoint>, Vec<MeasuredDepth>), TrackingError> {
         let (config, focal) = (&self.config, self.camera.pinhole.fx);
         let scale = focal * baseline_metres;
-        let eye = |grey| -> Result<_, TrackingError> {
-            let pyramid = self.extractor.pyramid(grey)?;
-            Ok((self.extractor.extract(&pyramid)?, pyramid))
-        };
-        let (left, right) = rayon::join(|| eye(left), || eye(right));
-        let ((keypoints, left), (others, right)) = (left?, right?);
-        let (left, right) = (Eye { keypoints: &keypoints, pyramid: &left }, Eye { keypoints: &others, pyramid: &right });
-        let disparities = disparities(left, right, focal, config.pyramid_scale)?;
+        let (left, right) = rayon::join(|| self.extractor.pyramid(left), || self.extractor.pyramid(right));
+        let (left, right) = (left?, right?);
+        let keypoints = self.extractor.extract(&left)?;
+        let disparities = disparities(&keypoints, &left, &right, focal / NEAREST_BASELINES)?;
         let sigma = |k: &Keypoint| config.disparity_sigma * config.pyramid_scale.powi(k.octave.into()) / scale;
         let depths = keypoints.iter().zip(disparities).map(|(k, disparity)| disparity.map(|d| (scale / d, sigma(k)))).collect();
         Ok((keypoints, depths))

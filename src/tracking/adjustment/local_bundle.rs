@@ -74,10 +74,10 @@ impl Adjustment {
         Some(Self { problem, keyframes, carried: Vec::new(), landmarks, observations, known, corrections })
     }
 
-    /// With the bias of a depth sensor among the unknowns, near what it was found to be before.
+    /// With the bias of measured depth among the unknowns.
     #[must_use]
-    pub fn with_bias(mut self, rig: &Rig) -> Self {
-        self.problem.bias_prior = Some(BiasPrior::after(&rig.depth_bias, rig.config.inverse_depth_sigma));
+    pub fn with_bias(mut self, prior: BiasPrior) -> Self {
+        self.problem.bias_prior = Some(prior);
         self
     }
 

@@ -1,100 +1,98 @@
-//! Disparities of keypoints in a row-aligned pair, to a fraction of a pixel (after Mur-Artal & Tardós, *ORB-SLAM2*, 2017, sec. III-A):
-//! the most similar descriptor on the same row, then the shift that aligns the grey patches, whole pixels first.
+//! Disparities of keypoints in a row-aligned pair, to a fraction of a pixel: the shift along the row, at the keypoint's own level, that aligns the grey
+//! patches, whole pixels first. The right image needs no keypoints: what is a corner for one eye need not be one for the other.
+
+use rayon::prelude::*;
 
 use crate::tracking::TrackingError;
 use crate::tracking::features::orb::{Keypoint, LevelImage, Pyramid};
 
-/// Largest Hamming distance of a match.
-const MAX_DISTANCE: u32 = 75;
-/// Rows that a match may be off, pixels at its own level.
-const ROW_BAND: f64 = 2.0;
-/// Half the side of the patches that are compared, and how far they are shifted, pixels at the keypoint's level.
+/// Half the side of the patches that are searched, and of those that are compared at last, pixels at the keypoint's level.
+const SEARCH: i64 = 5;
 const PATCH: i64 = 10;
-const SHIFT: i64 = 5;
+/// The best shift must differ less than this share of any that is farther from it than a corner is wide.
+const UNIQUE: f64 = 0.8;
+const CORNER: usize = 2;
 /// Gauss-Newton steps of the sub-pixel alignment, and the variance of the gradient along the row that it needs, (grey levels/pixel)².
 const REFINEMENTS: usize = 6;
 const LEAST_TEXTURE: f64 = 1.0;
 /// Pairs whose patches differ by more than this times the median are wrong.
 const MAX_DIFFERENCE: f64 = 2.1;
 
-/// One eye's keypoints, and the pyramid they were found in.
-#[derive(Clone, Copy, Debug)]
-pub struct Eye<'a> {
-    pub keypoints: &'a [Keypoint],
-    pub pyramid: &'a Pyramid,
-}
-
-/// The disparity of each left keypoint in pixels at full size, above 0 and at most `max_disparity`; `None` where no match is found.
+/// The disparity of each keypoint of the left image in pixels at full size, above 0 and at most `max_disparity`; `None` where no match is found.
+///
+/// # Errors
+/// If OpenCV fails.
 pub fn disparities(
-    left: Eye<'_>,
-    right: Eye<'_>,
+    keypoints: &[Keypoint],
+    left: &Pyramid,
+    right: &Pyramid,
     max_disparity: f64,
-    level_scale: f64,
 ) -> Result<Vec<Option<f64>>, TrackingError> {
-    let rows = by_row(right.keypoints, level_scale);
-    let mut found: Vec<Option<(f64, f64)>> = Vec::with_capacity(left.keypoints.len());
-    for keypoint in left.keypoints {
-        let candidates = rows.get(keypoint.pixel.y.round().max(0.0) as usize).map_or(&[][..], Vec::as_slice);
-        let fits = |other: &Keypoint| {
-            let disparity = keypoint.pixel.x - other.pixel.x;
-            other.octave.abs_diff(keypoint.octave) <= 1 && disparity >= -1.0 && disparity <= max_disparity
-        };
-        let best = candidates
-            .iter()
-            .map(|i| &right.keypoints[*i])
-            .filter(|other| fits(other))
-            .min_by_key(|other| keypoint.descriptor.distance(&other.descriptor))
-            .filter(|other| keypoint.descriptor.distance(&other.descriptor) < MAX_DISTANCE);
-        let aligned = match best {
-            Some(other) => align(keypoint, other.pixel.x, left.pyramid, right.pyramid)?,
-            None => None,
-        };
-        found.push(aligned.filter(|(disparity, _)| *disparity > 0.0 && *disparity <= max_disparity));
-    }
+    let match_one = |keypoint: &Keypoint| align(keypoint, left, right, max_disparity);
+    let found: Vec<Option<(f64, f64)>> = keypoints.par_iter().map(match_one).collect::<Result<_, _>>()?;
     let mut differences: Vec<f64> = found.iter().flatten().map(|(_, difference)| *difference).collect();
     differences.sort_by(f64::total_cmp);
     let limit = MAX_DIFFERENCE * differences.get(differences.len() / 2).copied().unwrap_or_default();
     Ok(found.into_iter().map(|f| f.filter(|(_, difference)| *difference <= limit).map(|(disparity, _)| disparity)).collect())
 }
 
-/// The keypoints that may match one on each row.
-fn by_row(keypoints: &[Keypoint], level_scale: f64) -> Vec<Vec<usize>> {
-    let mut rows: Vec<Vec<usize>> = Vec::new();
-    for (i, keypoint) in keypoints.iter().enumerate() {
-        let band = ROW_BAND * level_scale.powi(keypoint.octave.into());
-        let first = (keypoint.pixel.y - band).ceil().max(0.0) as usize;
-        let last = (keypoint.pixel.y + band).floor().max(0.0) as usize;
-        if rows.len() <= last {
-            rows.resize(last + 1, Vec::new());
-        }
-        rows[first..=last].iter_mut().for_each(|row| row.push(i));
-    }
-    rows
-}
-
 /// `(disparity, mean difference of the patches)` where the patches match best; `None` at the border, or without a clear minimum.
-fn align(keypoint: &Keypoint, right_x: f64, left: &Pyramid, right: &Pyramid) -> Result<Option<(f64, f64)>, TrackingError> {
+fn align(keypoint: &Keypoint, left: &Pyramid, right: &Pyramid, max_disparity: f64) -> Result<Option<(f64, f64)>, TrackingError> {
     let (full, level, other) = (left.level(0)?, left.level(keypoint.octave)?, right.level(keypoint.octave)?);
     let (sx, sy) = (level.width as f64 / full.width as f64, level.height as f64 / full.height as f64);
     // Pixel centres stay where they belong when an image is resized.
     let at_level = |v: f64, scale: f64| ((v + 0.5) * scale - 0.5).round() as i64;
     let (x, y) = (at_level(keypoint.pixel.x, sx), at_level(keypoint.pixel.y, sy));
-    let start = at_level(right_x, sx);
-    let inside = |image: &LevelImage<'_>, x: i64, reach: i64| {
-        x - reach >= 0 && x + reach < image.width as i64 && y - PATCH >= 0 && y + PATCH < image.height as i64
+    let inside = |x: i64| x - PATCH >= 0 && x + PATCH < level.width as i64 && y - PATCH >= 0 && y + PATCH < level.height as i64;
+    let farthest = (max_disparity * sx) as i64;
+    let Some(nearest) = search(&level, x, &other, y, farthest).filter(|nearest| inside(x) && inside(*nearest)) else {
+        return Ok(None);
     };
-    if !inside(&level, x, PATCH) || !inside(&other, start, PATCH + SHIFT) {
-        return Ok(None);
-    }
-    let differences: Vec<f64> = (-SHIFT..=SHIFT).map(|shift| difference(&level, x, &other, start + shift, y)).collect();
-    let best = (0..differences.len()).min_by(|a, b| differences[*a].total_cmp(&differences[*b])).unwrap_or(0);
-    if best == 0 || best + 1 == differences.len() {
-        return Ok(None);
-    }
-    let nearest = start - SHIFT + best as i64;
     // Both are taken at the level, so that rounding the left position to a pixel of the level cancels.
-    let aligned = refine(&level, x, &other, nearest, y).map(|shifted| ((x as f64 - shifted) / sx, differences[best]));
-    Ok(aligned)
+    let shifted = refine(&level, x, &other, nearest, y);
+    let disparity = shifted.map(|shifted| (x as f64 - shifted) / sx).filter(|d| *d > 0.0 && *d <= max_disparity);
+    Ok(disparity.map(|disparity| (disparity, difference(&level, x, &other, nearest, y))))
+}
+
+/// The pixel of the right image's row, at most `farthest` to the left, whose patch differs least from the left image's at `left_x`; `None` at the border,
+/// at either end of the range, or where another is nearly as good.
+fn search(left: &LevelImage<'_>, left_x: i64, right: &LevelImage<'_>, y: i64, farthest: i64) -> Option<i64> {
+    const SIDE: usize = 2 * SEARCH as usize + 1;
+    const COUNT: i32 = (SIDE * SIDE) as i32;
+    let first = (left_x - farthest - 1).max(SEARCH);
+    let last = (left_x + 1).min(right.width as i64 - 1 - SEARCH);
+    let is_inside = left_x >= SEARCH && left_x + SEARCH < left.width as i64 && y >= SEARCH && y + SEARCH < left.height as i64;
+    if !is_inside || last - first < 2 {
+        return None;
+    }
+    let count = (last - first + 1) as usize;
+    let row = |image: &LevelImage<'_>, v: i64, x: i64| ((y + v) * image.width as i64 + x - SEARCH) as usize;
+    let rows = || {
+        (-SEARCH..=SEARCH)
+            .map(|v| (&left.pixels[row(left, v, left_x)..][..SIDE], &right.pixels[row(right, v, first)..][..count + SIDE - 1]))
+    };
+    // Each patch less its own mean: an exposure that differs does not matter.
+    let mut columns = vec![0i32; count + SIDE - 1];
+    let mut left_sum = 0;
+    for (a, b) in rows() {
+        left_sum += a.iter().map(|value| i32::from(*value)).sum::<i32>();
+        columns.iter_mut().zip(b).for_each(|(sum, value)| *sum += i32::from(*value));
+    }
+    let offsets: Vec<i16> =
+        columns.windows(SIDE).map(|window| ((window.iter().sum::<i32>() - left_sum) / COUNT) as i16).collect();
+    let mut costs = vec![0i16; count];
+    for (a, b) in rows() {
+        for (u, value) in a.iter().enumerate() {
+            let value = i16::from(*value);
+            for ((cost, other), offset) in costs.iter_mut().zip(&b[u..]).zip(&offsets) {
+                *cost = cost.saturating_add((value + offset - i16::from(*other)).abs());
+            }
+        }
+    }
+    let best = (0..count).min_by_key(|at| costs[*at])?;
+    let rival = costs.iter().enumerate().filter(|(at, _)| at.abs_diff(best) > CORNER).map(|(_, cost)| *cost).min();
+    let is_clear = best > 0 && best + 1 < count && rival.is_none_or(|rival| f64::from(costs[best]) < UNIQUE * f64::from(rival));
+    is_clear.then_some(first + best as i64)
 }
 
 /// The position in the right image, to a fraction of a pixel, whose patch differs least from the left one's up to a constant: Gauss-Newton
@@ -183,13 +181,42 @@ mod tests {
         let extractor = Extractor::new(320, 240, 600, &config);
         let (left, right) = pair(12.3);
         let (left, right) = (extractor.pyramid(&left).unwrap(), extractor.pyramid(&right).unwrap());
-        let (a, b) = (extractor.extract(&left).unwrap(), extractor.extract(&right).unwrap());
-        let eye = |keypoints, pyramid| Eye { keypoints, pyramid };
-        let found = disparities(eye(&a, &left), eye(&b, &right), 60.0, config.pyramid_scale).unwrap();
+        let keypoints = extractor.extract(&left).unwrap();
+        let found = disparities(&keypoints, &left, &right, 60.0).unwrap();
         let mut errors: Vec<f64> = found.iter().flatten().map(|d| (d - 12.3).abs()).collect();
         errors.sort_by(f64::total_cmp);
-        assert!(errors.len() > a.len() / 3, "{} of {}", errors.len(), a.len());
+        assert!(errors.len() > keypoints.len() / 3, "{} of {}", errors.len(), keypoints.len());
         assert!(errors[errors.len() / 2] < 0.05, "median error {}", errors[errors.len() / 2]);
         assert!(errors[errors.len() * 9 / 10] < 0.3, "90% below {}", errors[errors.len() * 9 / 10]);
+    }
+
+    #[test]
+    fn where_a_pattern_repeats_no_disparity_is_taken() {
+        let config = TrackingConfig::default();
+        let extractor = Extractor::new(320, 240, 300, &config);
+        // Squares every 20 pixels, of one grey above, of many below.
+        let mut random = fastrand::Rng::with_seed(4);
+        let greys: Vec<u8> = (0..17 * 12).map(|_| random.u8(60..)).collect();
+        let square = |x: i32, y: i32| {
+            let grey = if y < 120 { 200 } else { greys[(y / 20 * 17 + x / 20) as usize] };
+            if x % 20 < 10 && y % 20 < 10 { grey } else { 20 }
+        };
+        let picture = |offset: i32| -> Vec<u8> { (0..320 * 240).map(|i| square(i % 320 + offset, i / 320)).collect() };
+        let (left, right) = (extractor.pyramid(&picture(0)).unwrap(), extractor.pyramid(&picture(8)).unwrap());
+        let keypoints = extractor.extract(&left).unwrap();
+        let found = disparities(&keypoints, &left, &right, 100.0).unwrap();
+        let share = |below: bool| {
+            let own = || {
+                keypoints
+                    .iter()
+                    .zip(&found)
+                    .filter(|(k, _)| k.octave == 0 && (k.pixel.y > 130.0) == below && (k.pixel.y - 120.0).abs() > 10.0)
+            };
+            own().filter(|(_, d)| d.is_some()).count() as f64 / own().count() as f64
+        };
+        assert!(share(false) < 0.1 && share(true) > 0.5, "{} {}", share(false), share(true));
+        let below: Vec<f64> = keypoints.iter().zip(&found).filter(|(k, _)| k.pixel.y > 130.0).filter_map(|(_, d)| *d).collect();
+        let true_ones = below.iter().filter(|d| (**d - 8.0).abs() < 1.0).count();
+        assert!(true_ones as f64 > 0.95 * below.len() as f64, "{true_ones} of {}", below.len());
     }
 }

@@ -107,6 +107,25 @@ fn a_bias_of_the_depth_is_found() {
 }
 
 #[test]
+fn the_offset_of_a_pairs_disparities_is_found_and_no_tilt() {
+    const SCALE: f64 = 50.0;
+    let (mut problem, truth) = scene(0.5, false);
+    let offset = 0.1 / SCALE;
+    for o in &mut problem.observations {
+        o.measurement.inverse_depth = o.measurement.inverse_depth.map(|measured| measured + offset);
+    }
+    let mut unaware = problem.clone();
+    problem.bias_prior = Some(BiasPrior::of_pair(SCALE));
+    problem.solve(&PINHOLE, 50);
+    unaware.solve(&PINHOLE, 50);
+    let found = problem.depth_bias.0;
+    // A few dozen points say half of it.
+    assert!(found.x > 0.3 * offset && found.x < offset && found.yz().norm() < 1e-2 * offset, "{found}");
+    let (error, without) = (worst_pose_error(&problem, &truth), worst_pose_error(&unaware, &truth));
+    assert!(error < 0.9 * without, "{error} {without}");
+}
+
+#[test]
 fn the_gradient_by_the_bias_is_the_numerical_derivative_of_the_cost() {
     let (mut problem, _) = scene(0.5, false);
     problem.depth_bias = DepthBias(Vector3::new(0.002, -0.005, 0.004));

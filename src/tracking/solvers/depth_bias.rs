@@ -1,5 +1,7 @@
 //! The systematic error of measured depth, which bundle adjustment finds beside poses and points.
 //!
+//! Rectification leaves the rows of a pair shifted by some hundredths of a pixel: disparities have an offset, which makes what is far too far, and
+//! the trajectory too long.
 //! Structured light measures disparity. Errors of its calibration, and of its registration with the colour camera, are therefore smooth over the
 //! image in inverse depth (Herrera C. et al., *Joint depth and color camera calibration with distortion correction*, 2012).
 
@@ -13,6 +15,11 @@ use crate::geometry::Pinhole;
 const STEP: Vector3<f64> = Vector3::new(0.0004, 0.04, 0.04);
 /// How large it is in all, likewise.
 const SIZE: Vector3<f64> = Vector3::new(0.004, 0.4, 0.4);
+
+/// Standard deviation of the offset of disparities, pixels.
+const PAIR_OFFSET_PIXELS: f64 = 0.07;
+/// That of their tilts, as a share of it: none are sought.
+const PAIR_TILT: f64 = 1e-3;
 
 /// Measured inverse depth minus the true one, 1/metres: a plane over the image. Offset, tilt along x, tilt along y, each for half the image's
 /// width.
@@ -49,6 +56,15 @@ impl BiasPrior {
         let small = (SIZE * sigma).map(|s| s.powi(-2));
         let information = near + small;
         Self { mean: DepthBias(last.0.component_mul(&near).component_div(&information)), information }
+    }
+
+    /// For a rectified pair; `scale` is depth times disparity, metres times pixels.
+    ///
+    /// Each adjustment starts from zero. What the lens model leaves out looks like an offset, too, and would add up.
+    pub fn of_pair(scale: f64) -> Self {
+        let offset = PAIR_OFFSET_PIXELS / scale;
+        let deviations = Vector3::new(offset, PAIR_TILT * offset, PAIR_TILT * offset);
+        Self { mean: DepthBias::default(), information: deviations.map(|s| s.powi(-2)) }
     }
 
     /// Half of the cost's gradient, and the cost.

@@ -12,6 +12,8 @@ use crate::geometry::Se3;
 use crate::sequence::Sensor;
 use crate::tracking::adjustment::local_bundle::Adjustment;
 use crate::tracking::map::keyframe_culling::{cull_around, thin};
+use crate::tracking::rig::Rig;
+use crate::tracking::solvers::depth_bias::BiasPrior;
 use crate::tracking::worker::Worker;
 use crate::tracking::{KeyframeUpdate, StageTimes, TrackingError};
 
@@ -194,12 +196,19 @@ impl Tracker {
 
     /// An adjustment with the bias among its unknowns, where it is estimated.
     fn with_bias(&self, adjustment: Adjustment) -> Adjustment {
-        if self.seeks_bias() { adjustment.with_bias(&self.rig) } else { adjustment }
+        if !self.seeks_bias() {
+            return adjustment;
+        }
+        let Rig { pinhole, config, depth_bias } = &self.rig;
+        adjustment.with_bias(match self.sensor {
+            Sensor::Stereo { baseline_metres } => BiasPrior::of_pair(pinhole.fx * baseline_metres),
+            _ => BiasPrior::after(depth_bias, config.inverse_depth_sigma),
+        })
     }
 
-    /// Whether the bias of depth is estimated: of depth images only, for rectified pairs are calibrated together.
+    /// Whether the bias of depth is estimated.
     pub(super) fn seeks_bias(&self) -> bool {
-        self.rig.config.depth_bias && self.sensor == Sensor::Rgbd
+        self.rig.config.depth_bias && self.sensor != Sensor::Mono
     }
 
     fn begin(&mut self, adjustment: Adjustment, around: usize) -> Result<(), TrackingError> {

@@ -45,6 +45,9 @@ const FEW_INLIERS: usize = 50;
 /// Without depth, keyframes further apart are worth more: a window then spans a wider baseline, which is all that fixes the points.
 const MONO_SPACING: f64 = 1.65;
 
+/// With fewer inliers at a predicted pose, or no motion to predict it by, a pose without a prediction is tried as well: a few far points agree with
+/// many poses.
+const SURE_INLIERS: usize = 40;
 /// A true pose agrees with well over half of its matches, one by chance with few.
 const MIN_INLIER_SHARE: f64 = 0.35;
 
@@ -270,15 +273,15 @@ impl Tracker {
         let mut found = None;
         if !self.lostness.is_lost {
             let view = context.view_of_last(last);
-            if let Some(start) = context.with_motion_model(features, &view, &predicted) {
-                found = Some(context.in_local_map(features, &start, reference)).filter(|f| f.inliers >= needed);
-            }
-            if found.is_none()
-                && let Some(start) = context
+            let start = context.with_motion_model(features, &view, &predicted);
+            let is_sure = self.motion.velocity.is_some() && start.as_ref().is_some_and(|start| start.inliers >= SURE_INLIERS);
+            found = start.map(|start| context.in_local_map(features, &start, reference)).filter(|f| f.inliers >= needed);
+            if !is_sure || found.is_none() {
+                let start = context
                     .against_view(features, &view)
-                    .or_else(|| context.against_view(features, &context.view_of_keyframe(reference)))
-            {
-                found = Some(context.in_local_map(features, &start, reference)).filter(|f| f.inliers >= needed);
+                    .or_else(|| context.against_view(features, &context.view_of_keyframe(reference)));
+                let other = start.map(|start| context.in_local_map(features, &start, reference)).filter(|f| f.inliers >= needed);
+                found = other.filter(|o| found.as_ref().is_none_or(|f| o.inliers > f.inliers)).or(found);
             }
         }
         if found.is_none() {
