@@ -8,6 +8,7 @@ mod closing;
 mod dense_fallback;
 mod frames;
 mod keyframe_selection;
+mod pose_finding;
 mod start;
 mod submaps;
 
@@ -19,15 +20,15 @@ use adjusting::Adjusting;
 use closing::Closing;
 use frames::{Frames, Record, Sightings};
 pub use keyframe_selection::is_image_due;
+use pose_finding::FRESHLY_FOUND_FRAMES;
 
 use crate::geometry::{Camera, Se3, StampedPose};
 use crate::sequence::{Frame, Sensor};
 use crate::tracking::adjustment::local_bundle::Adjustment;
-use crate::tracking::features::frame_features::FrameFeatures;
 use crate::tracking::front_end::{ExtractedFrame, FrontEnd};
 use crate::tracking::initialisation::mono::FirstView;
 use crate::tracking::localisation::dense_alignment::DenseFrame;
-use crate::tracking::localisation::localise::{Context, LastFrame, Localised};
+use crate::tracking::localisation::localise::{LastFrame, Localised};
 use crate::tracking::loop_closing::{ClosedLoop, LoopCloser};
 use crate::tracking::map::insertion;
 use crate::tracking::map::sparse_map::{Keyframe, Map};
@@ -37,19 +38,10 @@ use crate::tracking::solvers::depth_bias::DepthBias;
 use crate::tracking::worker::Worker;
 use crate::tracking::{KeyframePose, NewKeyframe, StageTimes, TrackedFrame, TrackingConfig, TrackingError, TrackingState};
 
-/// For this many frames after the camera was found again, poses are held to the stricter count.
-const FRESHLY_FOUND_FRAMES: usize = 5;
-
 /// With fewer landmarks than this a pose is checked against all pixels, where there is depth.
 const FEW_INLIERS: usize = 50;
 /// Without depth, keyframes further apart are worth more: a window then spans a wider baseline, which is all that fixes the points.
 const MONO_SPACING: f64 = 1.65;
-
-/// With fewer inliers at a predicted pose, or no motion to predict it by, a pose without a prediction is tried as well: a few far points agree with
-/// many poses.
-const SURE_INLIERS: usize = 40;
-/// A true pose agrees with well over half of its matches, one by chance with few.
-const MIN_INLIER_SHARE: f64 = 0.35;
 
 /// The tracker, for any sensor.
 #[derive(Debug)]
@@ -261,38 +253,6 @@ impl Tracker {
     /// How many keyframes have not been culled.
     pub fn living_keyframes(&self) -> usize {
         self.map.living.len()
-    }
-
-    /// The frame's pose, if it can be trusted.
-    fn localise(&mut self, features: &FrameFeatures, last: &LastFrame) -> Option<Localised> {
-        let strict = self.lostness.is_lost || self.lostness.frames_since_found < FRESHLY_FOUND_FRAMES;
-        let needed = if strict { self.rig.config.min_relocalisation_inliers } else { self.rig.config.min_inliers };
-        let reference = self.motion.reference;
-        let predicted = self.motion.velocity.unwrap_or_default() * last.camera_from_world;
-        let mut context = Context { map: &mut self.map, rig: &self.rig };
-        let mut found = None;
-        if !self.lostness.is_lost {
-            let view = context.view_of_last(last);
-            let start = context.with_motion_model(features, &view, &predicted);
-            let is_sure = self.motion.velocity.is_some() && start.as_ref().is_some_and(|start| start.inliers >= SURE_INLIERS);
-            found = start.map(|start| context.in_local_map(features, &start, reference)).filter(|f| f.inliers >= needed);
-            if !is_sure || found.is_none() {
-                let start = context
-                    .against_view(features, &view)
-                    .or_else(|| context.against_view(features, &context.view_of_keyframe(reference)));
-                let other = start.map(|start| context.in_local_map(features, &start, reference)).filter(|f| f.inliers >= needed);
-                found = other.filter(|o| found.as_ref().is_none_or(|f| o.inliers > f.inliers)).or(found);
-            }
-        }
-        if found.is_none() {
-            let needed = self.rig.config.min_relocalisation_inliers;
-            found = context.relocalise(features, reference).filter(|f| f.inliers >= needed);
-        }
-        let trusted = |f: &Localised| {
-            let finite = f.camera_from_world.to_homogeneous().iter().all(|v| v.is_finite());
-            finite && f.inliers as f64 >= MIN_INLIER_SHARE * f.matches as f64
-        };
-        found.filter(trusted)
     }
 
     /// Takes a trusted pose in: motion, reference, record, and a keyframe if one is due.
