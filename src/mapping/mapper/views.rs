@@ -12,7 +12,7 @@ use crate::mapping::chunks::{Hidden, Outlook};
 const LEAST_SEEN: f32 = 0.5;
 /// Share of the keyframes near by that see a Gaussian from which steps can learn, at least, where the Gaussian is to be moved.
 const LEAST_LEARNABLE: f32 = 0.75;
-/// Keyframes near by that are looked at, so that the work for a keyframe does not grow with the map.
+/// Keyframes near by that are looked at, so that the work for a keyframe does not grow with the map; image-only ones between them come on top.
 const NEAR: usize = 256;
 
 impl Mapper {
@@ -31,15 +31,16 @@ impl Mapper {
         self.chunks.hidden_from(&self.keyframes[k].outlook())
     }
 
-    /// The keyframes nearest to this one, itself first.
+    /// The keyframes nearest to this one, itself first: [`NEAR`], and the image-only ones that are no farther.
     pub(super) fn keyframes_near(&self, k: usize) -> Vec<usize> {
         let here = self.keyframes[k].position();
         let distance = |keyframe: usize| (self.keyframes[keyframe].position() - here).norm_squared();
         let mut near: Vec<(f64, usize)> = (0..self.keyframes.len()).map(|k| (distance(k), k)).collect();
         let order = |a: &(f64, usize), b: &(f64, usize)| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1));
-        if near.len() > NEAR {
-            near.select_nth_unstable_by(NEAR, order);
-            near.truncate(NEAR);
+        let mut full: Vec<(f64, usize)> = near.iter().copied().filter(|(_, k)| !self.keyframes[*k].image_only).collect();
+        if full.len() > NEAR {
+            let (_, beyond, _) = full.select_nth_unstable_by(NEAR, order);
+            near.retain(|keyframe| order(keyframe, beyond).is_lt());
         }
         near.sort_unstable_by(order);
         near.into_iter().map(|(_, k)| k).collect()
