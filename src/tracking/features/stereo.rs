@@ -1,5 +1,5 @@
 //! Disparities of keypoints in a row-aligned pair, to a fraction of a pixel: the shift along the row, at the keypoint's own level, that aligns the grey
-//! patches, whole pixels first. The right image needs no keypoints: what is a corner for one eye need not be one for the other.
+//! patches, whole pixels first. The right image needs no keypoints: a corner of one image need not be one of the other.
 
 use rayon::prelude::*;
 
@@ -45,24 +45,22 @@ fn align(keypoint: &Keypoint, left: &Pyramid, right: &Pyramid, max_disparity: f6
     let (x, y) = (at_level(keypoint.pixel.x, sx), at_level(keypoint.pixel.y, sy));
     let inside = |x: i64| x - PATCH >= 0 && x + PATCH < level.width as i64 && y - PATCH >= 0 && y + PATCH < level.height as i64;
     let farthest = (max_disparity * sx) as i64;
-    let Some(nearest) = search(&level, x, &other, y, farthest).filter(|nearest| inside(x) && inside(*nearest)) else {
-        return Ok(None);
-    };
+    let nearest = if inside(x) { search(&level, x, &other, y, farthest) } else { None };
+    let Some(nearest) = nearest.filter(|nearest| inside(*nearest)) else { return Ok(None) };
     // Both are taken at the level, so that rounding the left position to a pixel of the level cancels.
     let shifted = refine(&level, x, &other, nearest, y);
     let disparity = shifted.map(|shifted| (x as f64 - shifted) / sx).filter(|d| *d > 0.0 && *d <= max_disparity);
     Ok(disparity.map(|disparity| (disparity, difference(&level, x, &other, nearest, y))))
 }
 
-/// The pixel of the right image's row, at most `farthest` to the left, whose patch differs least from the left image's at `left_x`; `None` at the border,
-/// at either end of the range, or where another is nearly as good.
+/// The pixel of the right image's row, at most `farthest` to the left, whose patch differs least from the left image's at `left_x`, which lies inside;
+/// `None` at either end of the range, or where another is nearly as good.
 fn search(left: &LevelImage<'_>, left_x: i64, right: &LevelImage<'_>, y: i64, farthest: i64) -> Option<i64> {
     const SIDE: usize = 2 * SEARCH as usize + 1;
     const COUNT: i32 = (SIDE * SIDE) as i32;
     let first = (left_x - farthest - 1).max(SEARCH);
     let last = (left_x + 1).min(right.width as i64 - 1 - SEARCH);
-    let is_inside = left_x >= SEARCH && left_x + SEARCH < left.width as i64 && y >= SEARCH && y + SEARCH < left.height as i64;
-    if !is_inside || last - first < 2 {
+    if last - first < 2 {
         return None;
     }
     let count = (last - first + 1) as usize;

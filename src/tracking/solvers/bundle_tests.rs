@@ -119,7 +119,7 @@ fn the_offset_of_a_pairs_disparities_is_found_and_no_tilt() {
     problem.solve(&PINHOLE, 50);
     unaware.solve(&PINHOLE, 50);
     let found = problem.depth_bias.0;
-    // A few dozen points say half of it.
+    // The prior holds it back: these are a few dozen points.
     assert!(found.x > 0.3 * offset && found.x < offset && found.yz().norm() < 1e-2 * offset, "{found}");
     let (error, without) = (worst_pose_error(&problem, &truth), worst_pose_error(&unaware, &truth));
     assert!(error < 0.9 * without, "{error} {without}");

@@ -2,6 +2,7 @@
 //!
 //! Rectification leaves the rows of a pair shifted by some hundredths of a pixel: disparities have an offset, which makes what is far too far, and
 //! the trajectory too long.
+//!
 //! Structured light measures disparity. Errors of its calibration, and of its registration with the colour camera, are therefore smooth over the
 //! image in inverse depth (Herrera C. et al., *Joint depth and color camera calibration with distortion correction*, 2012).
 

@@ -8,7 +8,7 @@ mod closing;
 mod dense_fallback;
 mod frames;
 mod keyframe_selection;
-mod pose_finding;
+mod localising;
 mod start;
 mod submaps;
 
@@ -20,7 +20,7 @@ use adjusting::Adjusting;
 use closing::Closing;
 use frames::{Frames, Record, Sightings};
 pub use keyframe_selection::is_image_due;
-use pose_finding::FRESHLY_FOUND_FRAMES;
+use localising::FRESHLY_FOUND_FRAMES;
 
 use crate::geometry::{Camera, Se3, StampedPose};
 use crate::sequence::{Frame, Sensor};

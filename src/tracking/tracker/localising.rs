@@ -1,4 +1,4 @@
-//! A frame's pose: by the motion model, by descriptors where that fails or there is none, from the map alone where both fail.
+//! A frame's pose, if it can be trusted: by the motion model, else by descriptors, else by relocalisation.
 
 use super::Tracker;
 use crate::tracking::features::frame_features::FrameFeatures;
@@ -6,8 +6,8 @@ use crate::tracking::localisation::localise::{Context, LastFrame, Localised};
 
 /// For this many frames after the camera was found again, poses are held to the stricter count.
 pub(super) const FRESHLY_FOUND_FRAMES: usize = 5;
-/// Where no motion predicts the pose, one by descriptors is tried as well, for a few far points agree with many poses. It is taken if it has this many
-/// times the inliers.
+/// Without a velocity, a pose by descriptors replaces that of the motion model from so many times its inliers on: a few far points agree with many
+/// poses.
 const CLEARLY_MORE: f64 = 1.5;
 /// A true pose agrees with well over half of its matches, one by chance with few.
 const MIN_INLIER_SHARE: f64 = 0.35;
@@ -25,9 +25,9 @@ impl Tracker {
             let view = context.view_of_last(last);
             let mut start = context.with_motion_model(features, &view, &predicted);
             if self.motion.velocity.is_none() {
-                let most = |found: &Option<Localised>| found.as_ref().map_or(0.0, |f| f.inliers as f64);
+                let inliers = |found: &Option<Localised>| found.as_ref().map_or(0.0, |f| f.inliers as f64);
                 let other = context.against_view(features, &view);
-                start = if most(&other) > CLEARLY_MORE * most(&start) { other } else { start };
+                start = if inliers(&other) > CLEARLY_MORE * inliers(&start) { other } else { start };
             }
             if let Some(start) = start {
                 found = Some(context.in_local_map(features, &start, reference)).filter(|f| f.inliers >= needed);
