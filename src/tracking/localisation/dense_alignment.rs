@@ -32,6 +32,8 @@ const MIN_OVERLAP: f64 = 0.3;
 const MIN_RESEMBLANCE: f64 = 0.6;
 /// The least information about any direction of motion, per point: (1/m)² or (1/rad)² over the squared residuals' scale.
 const MIN_INFORMATION: f64 = 0.05;
+/// Neighbouring pixels err together: so many say as much as one.
+const ERRING_TOGETHER: f64 = 300.0;
 
 /// A frame for dense alignment, `[height * width]` each.
 #[derive(Clone, Debug)]
@@ -155,6 +157,8 @@ pub struct Aligned {
     pub current_from_reference: Se3,
     /// Share of the reference's points that the current frame sees and confirms.
     pub overlap: f64,
+    /// Of a left perturbation (metres, radians).
+    pub information: Matrix6<f64>,
 }
 
 /// Normal equations of one level at one pose.
@@ -195,7 +199,7 @@ pub fn align(reference: &DenseFrame, current: &DenseFrame, guesses: &[Se3]) -> O
         let held = alike && agreement >= MIN_AGREEMENT && overlap >= MIN_OVERLAP && information >= MIN_INFORMATION;
         let cost = sums.cost / sums.in_view.max(1) as f64;
         if held && best.as_ref().is_none_or(|(least, _)| cost < *least) {
-            best = Some((cost, Aligned { current_from_reference: pose, overlap }));
+            best = Some((cost, Aligned { current_from_reference: pose, overlap, information: sums.hessian / ERRING_TOGETHER }));
         }
     }
     best.map(|(_, aligned)| aligned)

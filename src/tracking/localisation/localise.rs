@@ -12,7 +12,7 @@ use crate::tracking::features::projection::{Projection, ProjectionSearch};
 use crate::tracking::localisation::pnp::{pose_from_view, similar_keyframes};
 use crate::tracking::map::sparse_map::Map;
 use crate::tracking::rig::Rig;
-use crate::tracking::solvers::pose::{PoseObservation, optimise_pose};
+use crate::tracking::solvers::pose::{PoseObservation, PosePrior, optimise_pose};
 use crate::tracking::solvers::residual::InlierClass;
 
 /// Search radius around last frame's points, pixels at the finest level, widened in turn until enough are found.
@@ -36,6 +36,8 @@ const MAP_RULES: Rules = Rules { max_distance: 80, ratio: 0.8, check_rotation: f
 const LOCAL_KEYFRAMES: usize = 20;
 const LOCAL_NEAREST: usize = 5;
 const LOCAL_NEIGHBOURS: usize = 5;
+/// Landmarks that hold a pose which pixels hold too.
+const HELD_INLIERS: usize = 50;
 /// Keyframes tried when lost.
 const RELOCALISATION_KEYFRAMES: usize = 4;
 
@@ -59,8 +61,15 @@ pub struct Localised {
     pub matches: usize,
     /// Whether the pose came without a prediction.
     pub rough: bool,
-    /// Whether it is held by all pixels instead of by landmarks.
-    pub dense: bool,
+    /// What all pixels say of it, where landmarks are few.
+    pub prior: Option<PosePrior>,
+}
+
+impl Localised {
+    /// Whether landmarks hold it, not pixels alone.
+    pub fn is_held(&self) -> bool {
+        self.prior.is_none() || self.inliers >= HELD_INLIERS
+    }
 }
 
 /// Features whose points in the world are known (`None` where not), and the landmarks among these.
@@ -102,7 +111,8 @@ impl Context<'_> {
     pub fn against_view(&self, frame: &FrameFeatures, view: &View) -> Option<Localised> {
         let rough = pose_from_view(&view.features.features, &view.points, frame, &self.rig.pinhole)?;
         let pairs: Vec<(usize, usize)> = rough.matches.iter().map(|m| (m.query, m.feature)).collect();
-        let mut found = self.optimise_over(frame, &rough.camera_from_world, &pairs, |i| view.points[i], |i| view.landmarks[i]);
+        let mut found =
+            self.optimise_over(frame, &rough.camera_from_world, None, &pairs, |i| view.points[i], |i| view.landmarks[i]);
         if found.inliers >= ROUGH_INLIERS {
             let (guided, _) = self.search(frame, view, &found.camera_from_world, MOTION_RADII[1]);
             found = if guided.inliers > found.inliers { guided } else { found };
@@ -165,7 +175,8 @@ impl Context<'_> {
         let search = ProjectionSearch { taken: &taken, coarser_octaves: 0, rules: MAP_RULES };
         let found = search.run(frame, &visible, radius, self.rig);
         pairs.extend(found.iter().map(|m| (m.point, m.feature)));
-        let mut found = self.optimise_over(frame, &start.camera_from_world, &pairs, |l| Some(self.map.position(l)), Some);
+        let point = |l| Some(self.map.position(l));
+        let mut found = self.optimise_over(frame, &start.camera_from_world, start.prior, &pairs, point, Some);
         found.rough = start.rough;
         for l in found.landmarks.iter().flatten() {
             self.map.landmarks[*l].observed += 1;
@@ -173,21 +184,17 @@ impl Context<'_> {
         found
     }
 
-    /// At a pose that something else has found: the landmarks that agree with it.
-    pub fn at_pose(&mut self, frame: &FrameFeatures, camera_from_world: Se3, reference: usize) -> Localised {
-        let blank =
-            Localised { camera_from_world, landmarks: vec![None; frame.len()], inliers: 0, matches: 0, rough: true, dense: true };
-        let found = self.in_local_map(frame, &blank, reference);
-        let mut landmarks = found.landmarks;
-        for (feature, landmark) in landmarks.iter_mut().enumerate() {
-            let agrees = |l: &usize| {
-                let p_in_camera = (camera_from_world * self.map.position(*l)).coords;
-                self.rig.measurement(&frame.features[feature]).classify(&self.rig.pinhole, &p_in_camera) != InlierClass::Outlier
-            };
-            *landmark = landmark.filter(agrees);
-        }
-        let inliers = landmarks.iter().flatten().count();
-        Localised { landmarks, inliers, ..blank }
+    /// From a prior, with the landmarks that agree near it.
+    pub fn near(&mut self, frame: &FrameFeatures, prior: PosePrior, reference: usize) -> Localised {
+        let blank = Localised {
+            camera_from_world: prior.camera_from_world,
+            landmarks: vec![None; frame.len()],
+            inliers: 0,
+            matches: 0,
+            rough: true,
+            prior: Some(prior),
+        };
+        self.in_local_map(frame, &blank, reference)
     }
 
     /// Optimises a pose over pairs (source that `known` knows the point of, feature) and keeps the landmarks that agree.
@@ -195,6 +202,7 @@ impl Context<'_> {
         &self,
         frame: &FrameFeatures,
         initial: &Se3,
+        prior: Option<PosePrior>,
         pairs: &[(usize, usize)],
         known: impl Fn(usize) -> Option<Point3<f64>>,
         landmark_of: impl Fn(usize) -> Option<usize>,
@@ -208,7 +216,7 @@ impl Context<'_> {
             })
             .collect();
         let observations: Vec<PoseObservation> = usable.iter().map(|u| u.2).collect();
-        let estimate = optimise_pose(&self.rig.pinhole, initial, &observations);
+        let estimate = optimise_pose(&self.rig.pinhole, initial, prior.as_ref(), &observations);
         for ((source, feature, _), class) in usable.iter().zip(&estimate.classes) {
             if *class != InlierClass::Outlier {
                 landmarks[*feature] = landmark_of(*source);
@@ -220,7 +228,7 @@ impl Context<'_> {
             inliers: estimate.inliers,
             matches: usable.len(),
             rough: false,
-            dense: false,
+            prior,
         }
     }
 
@@ -243,7 +251,7 @@ impl Context<'_> {
             view.features.features.iter().zip(&view.points).enumerate().filter_map(project).collect();
         let matches = MOTION_SEARCH.run(frame, &projections, |_| radius, self.rig);
         let pairs: Vec<(usize, usize)> = matches.iter().map(|m| (m.point, m.feature)).collect();
-        (self.optimise_over(frame, pose, &pairs, |i| view.points[i], |i| view.landmarks[i]), matches.len())
+        (self.optimise_over(frame, pose, None, &pairs, |i| view.points[i], |i| view.landmarks[i]), matches.len())
     }
 
     fn local_landmarks(&self, start: &Localised, reference: usize) -> Vec<usize> {

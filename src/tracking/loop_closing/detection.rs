@@ -187,7 +187,7 @@ impl Search<'_> {
             measurement: self.rig.measurement(&features.features[m.feature]),
         };
         let observations: Vec<PoseObservation> = found.iter().map(observation).collect();
-        let estimate = optimise_pose(&self.rig.pinhole, camera_from_world, &observations);
+        let estimate = optimise_pose(&self.rig.pinhole, camera_from_world, None, &observations);
         let good = found.iter().zip(&estimate.classes).filter(|(_, class)| **class != InlierClass::Outlier);
         let matches = good.map(|(m, _)| (m.point, m.feature)).collect();
         Seen { camera_from_world: estimate.camera_from_world, matches, expected: visible.len() }

@@ -25,6 +25,23 @@ pub struct PoseObservation {
     pub measurement: Measurement,
 }
 
+/// What is known of a pose beside the observations.
+#[derive(Clone, Copy, Debug)]
+pub struct PosePrior {
+    pub camera_from_world: Se3,
+    /// Of a left perturbation (metres, radians).
+    pub information: Matrix6<f64>,
+}
+
+impl PosePrior {
+    /// Gradient and cost at a pose near the prior's.
+    fn pull(&self, pose: &Se3) -> (Vector6<f64>, f64) {
+        let error = se3::log(&(pose * self.camera_from_world.inverse()));
+        let gradient = self.information * error;
+        (gradient, gradient.dot(&error))
+    }
+}
+
 /// The result of [`optimise_pose`].
 #[derive(Clone, Debug)]
 pub struct PoseEstimate {
@@ -36,7 +53,12 @@ pub struct PoseEstimate {
 
 /// The pose that explains the observations best, from `initial` (camera_from_world). Without enough to go by, `initial` comes back
 /// with every observation an outlier.
-pub fn optimise_pose(pinhole: &Pinhole, initial: &Se3, observations: &[PoseObservation]) -> PoseEstimate {
+pub fn optimise_pose(
+    pinhole: &Pinhole,
+    initial: &Se3,
+    prior: Option<&PosePrior>,
+    observations: &[PoseObservation],
+) -> PoseEstimate {
     let mut pose = *initial;
     let mut classes: Vec<InlierClass> = observations
         .iter()
@@ -50,8 +72,8 @@ pub fn optimise_pose(pinhole: &Pinhole, initial: &Se3, observations: &[PoseObser
                 inliers: 0,
             };
         }
-        let round =
-            Round { robust: round < ROBUST_ROUNDS, converged: if round + 1 == ROUNDS { CONVERGED } else { NEARLY_CONVERGED } };
+        let converged = if round + 1 == ROUNDS { CONVERGED } else { NEARLY_CONVERGED };
+        let round = Round { robust: round < ROBUST_ROUNDS, converged, prior };
         pose = refine(pinhole, &pose, observations, &classes, &round);
         for (t, o) in classes.iter_mut().zip(observations) {
             *t = o.measurement.classify(pinhole, &(pose * o.point_in_world).coords);
@@ -62,18 +84,19 @@ pub fn optimise_pose(pinhole: &Pinhole, initial: &Se3, observations: &[PoseObser
 }
 
 /// How one round is solved.
-struct Round {
+struct Round<'a> {
     /// With Huber's kernel.
     robust: bool,
     /// The step below which it ends.
     converged: f64,
+    prior: Option<&'a PosePrior>,
 }
 
 /// Levenberg-Marquardt over the trusted observations.
-fn refine(pinhole: &Pinhole, initial: &Se3, observations: &[PoseObservation], classes: &[InlierClass], round: &Round) -> Se3 {
+fn refine(pinhole: &Pinhole, initial: &Se3, observations: &[PoseObservation], classes: &[InlierClass], round: &Round<'_>) -> Se3 {
     let mut pose = *initial;
     let mut lambda = 1e-4;
-    let (mut hessian, mut gradient, mut cost) = linearise(pinhole, &pose, observations, classes, round.robust);
+    let (mut hessian, mut gradient, mut cost) = linearise(pinhole, &pose, observations, classes, round);
     for _ in 0..STEPS_PER_ROUND {
         let mut damped = hessian;
         for k in 0..6 {
@@ -81,7 +104,7 @@ fn refine(pinhole: &Pinhole, initial: &Se3, observations: &[PoseObservation], cl
         }
         let Some(step) = damped.cholesky().map(|c| c.solve(&-gradient)) else { break };
         let candidate = se3::exp(&step) * pose;
-        let (h, g, candidate_cost) = linearise(pinhole, &candidate, observations, classes, round.robust);
+        let (h, g, candidate_cost) = linearise(pinhole, &candidate, observations, classes, round);
         if candidate_cost < cost {
             (pose, hessian, gradient, cost) = (candidate, h, g, candidate_cost);
             lambda *= 0.1;
@@ -102,7 +125,7 @@ fn linearise(
     pose: &Se3,
     observations: &[PoseObservation],
     classes: &[InlierClass],
-    robust: bool,
+    round: &Round<'_>,
 ) -> (Matrix6<f64>, Vector6<f64>, f64) {
     const BEHIND_COST: f64 = 1e4;
     let (mut hessian, mut gradient, mut cost) = (Matrix6::zeros(), Vector6::zeros(), 0.0);
@@ -114,7 +137,7 @@ fn linearise(
             continue;
         };
         let (rho, weights) =
-            if robust { Measurement::robust(&residual) } else { (residual.norm_squared(), Vector3::repeat(1.0)) };
+            if round.robust { Measurement::robust(&residual) } else { (residual.norm_squared(), Vector3::repeat(1.0)) };
         let j = measurement.jacobian_by_pose(pinhole, &p_in_camera);
         for row in 0..6 {
             let weighted = j.column(row).component_mul(&weights);
@@ -126,6 +149,10 @@ fn linearise(
         cost += rho;
     }
     hessian.fill_upper_triangle_with_lower_triangle();
+    if let Some(prior) = round.prior {
+        let (pull, share) = prior.pull(pose);
+        (hessian, gradient, cost) = (hessian + prior.information, gradient + pull, cost + share);
+    }
     (hessian, gradient, cost)
 }
 
@@ -169,7 +196,7 @@ mod tests {
         let truth = se3::exp(&Vector6::new(0.3, -0.2, 0.4, 0.2, -0.1, 0.3));
         let initial = se3::exp(&Vector6::new(0.08, -0.05, 0.06, 0.04, 0.03, -0.04)) * truth;
         for with_depth in [true, false] {
-            let found = optimise_pose(&PINHOLE, &initial, &scene(&truth, with_depth));
+            let found = optimise_pose(&PINHOLE, &initial, None, &scene(&truth, with_depth));
             let error = se3::log(&(found.camera_from_world * truth.inverse()));
             assert!(error.fixed_rows::<3>(0).norm() < 2e-3 && error.fixed_rows::<3>(3).norm() < 1e-3, "{error}");
             for (i, classes) in found.classes.iter().enumerate() {
@@ -184,9 +211,37 @@ mod tests {
     }
 
     #[test]
+    fn a_prior_holds_what_the_observations_leave_open() {
+        let truth = se3::exp(&Vector6::new(0.3, -0.2, 0.4, 0.2, -0.1, 0.3));
+        // Points so far away that they tell the rotation alone.
+        let mut random = fastrand::Rng::with_seed(5);
+        let far: Vec<PoseObservation> = (0..60)
+            .map(|_| {
+                let pixel = Vector2::new(random.f64() * 640.0, random.f64() * 480.0);
+                let point_in_world = truth.inverse() * Point3::from(PINHOLE.unproject(&pixel, 1e4));
+                PoseObservation {
+                    point_in_world,
+                    measurement: Measurement { pixel, inverse_depth: None, pixel_weight: 1.0, depth_weight: 0.0 },
+                }
+            })
+            .collect();
+        let near = se3::exp(&Vector6::new(0.02, -0.01, 0.03, 0.02, 0.01, -0.02)) * truth;
+        let found = |sigma: f64| {
+            let prior = PosePrior { camera_from_world: near, information: Matrix6::identity() / (sigma * sigma) };
+            optimise_pose(&PINHOLE, &near, Some(&prior), &far).camera_from_world
+        };
+        let weak = found(0.05);
+        assert!(weak.rotation.angle_to(&truth.rotation) < 1e-4, "{}", weak.rotation.angle_to(&truth.rotation));
+        // The camera turns where it is by the prior, up to what its covariance ties translation to rotation by.
+        assert!((weak.translation.vector - near.translation.vector).norm() < 0.02);
+        let strong = found(1e-7);
+        assert!(se3::log(&(strong * near.inverse())).norm() < 1e-6);
+    }
+
+    #[test]
     fn with_nothing_to_go_by_the_initial_pose_comes_back() {
         let initial = se3::exp(&Vector6::new(0.3, -0.2, 0.4, 0.2, -0.1, 0.3));
-        let found = optimise_pose(&PINHOLE, &initial, &scene(&initial, true)[..2]);
+        let found = optimise_pose(&PINHOLE, &initial, None, &scene(&initial, true)[..2]);
         assert_eq!((found.camera_from_world, found.inliers), (initial, 0));
     }
 }

@@ -9,6 +9,7 @@ use crate::tracking::front_end::ExtractedFrame;
 use crate::tracking::localisation::dense_alignment::{DenseFrame, align};
 use crate::tracking::localisation::localise::LastFrame;
 use crate::tracking::localisation::localise::{Context, Localised};
+use crate::tracking::solvers::pose::PosePrior;
 
 /// Frames without a pose after which pixels no longer say where the camera is.
 const MAX_FRAMES_BRIDGED: usize = 2;
@@ -25,16 +26,20 @@ impl Tracker {
         let (dense, before) = (frame.dense.as_ref()?, self.dense.last.as_ref()?);
         let mut guesses = vec![self.motion.velocity.unwrap_or_default(), Se3::identity()];
         guesses.extend(guess.map(|pose| pose * last.camera_from_world.inverse()));
-        let mut camera_from_world = align(before, dense, &guesses)?.current_from_reference * last.camera_from_world;
+        let found = align(before, dense, &guesses)?;
+        let mut prior = PosePrior {
+            camera_from_world: found.current_from_reference * last.camera_from_world,
+            information: found.information,
+        };
         if let Some((keyframe, view)) = &self.dense.keyframe {
             let pose = self.map.keyframes[*keyframe].camera_from_world;
-            let guess = camera_from_world * pose.inverse();
+            let guess = prior.camera_from_world * pose.inverse();
             if let Some(found) = align(view, dense, &[guess]).filter(|found| found.overlap >= KEYFRAME_OVERLAP) {
-                camera_from_world = found.current_from_reference * pose;
+                prior = PosePrior { camera_from_world: found.current_from_reference * pose, information: found.information };
             }
         }
         let mut context = Context { map: &mut self.map, rig: &self.rig };
-        Some(context.at_pose(&frame.features, camera_from_world, self.motion.reference))
+        Some(context.near(&frame.features, prior, self.motion.reference))
     }
 
     /// How many frames are missing between the last one and this, going by the interval before.

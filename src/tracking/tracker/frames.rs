@@ -113,7 +113,7 @@ impl Record {
     /// Solves the pose by the landmarks as they are now; `false` where too few are left or agree.
     fn settle(&mut self, map: &Map, rig: &Rig) -> bool {
         let sightings = std::mem::take(&mut self.sightings);
-        let found = optimise_pose(&rig.pinhole, &self.pose(map), &sightings.observations(map, rig));
+        let found = optimise_pose(&rig.pinhole, &self.pose(map), None, &sightings.observations(map, rig));
         let needed = (LEAST_AGREEING * sightings.seen.len() as f64).max(rig.config.min_inliers as f64);
         let agrees = found.inliers as f64 >= needed;
         if agrees {

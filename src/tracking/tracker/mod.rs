@@ -38,8 +38,8 @@ use crate::tracking::solvers::depth_bias::DepthBias;
 use crate::tracking::worker::Worker;
 use crate::tracking::{KeyframePose, NewKeyframe, StageTimes, TrackedFrame, TrackingConfig, TrackingError, TrackingState};
 
-/// With fewer landmarks than this a pose is checked against all pixels, where there is depth.
-const FEW_INLIERS: usize = 50;
+/// With fewer landmarks than this, all pixels hold a pose too, where there is depth.
+const FEW_INLIERS: usize = 100;
 /// Without depth, keyframes further apart are worth more: a window then spans a wider baseline, which is all that fixes the points.
 const MONO_SPACING: f64 = 1.65;
 
@@ -274,18 +274,19 @@ impl Tracker {
         let features = frame.features.clone();
         let due =
             may_be_keyframe && keyframe_selection::is_due(&self.map, &features, &found, self.motion.reference, &self.rig.config);
-        let Localised { camera_from_world, landmarks, inliers, dense, .. } = found;
+        let is_held = found.is_held();
+        let Localised { camera_from_world, landmarks, inliers, .. } = found;
         let camera_from_reference = self.map.keyframes[self.motion.reference].relative(&camera_from_world);
-        let sightings = if dense { Sightings::default() } else { Sightings::new(&features, &landmarks, &self.map, &self.rig) };
+        let sightings = if is_held { Sightings::new(&features, &landmarks, &self.map, &self.rig) } else { Sightings::default() };
         self.record(frame, self.motion.reference, camera_from_reference, sightings);
         let motion = |before: &Se3| {
             let between = [before, &camera_from_world];
             keyframe_selection::motion(&self.map, &features, between, self.motion.reference, &self.rig.config)
         };
-        let image_due = may_be_keyframe && !due && !dense && self.is_image_due(motion);
+        let image_due = may_be_keyframe && !due && is_held && self.is_image_due(motion);
         self.motion.last = Some(LastFrame { features, camera_from_world, landmarks });
         let new_keyframe = match (due, image_due) {
-            (true, _) => self.make_keyframe(frame, !dense, &mut times)?,
+            (true, _) => self.make_keyframe(frame, is_held, &mut times)?,
             (false, true) => self.make_image_only(),
             (false, false) => None,
         };

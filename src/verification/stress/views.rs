@@ -75,7 +75,7 @@ fn pose(rng: &mut Rng, world: &World, with_depth: bool, outliers: f64) -> Outcom
     };
     let information = information(residuals, 6);
     let initial = step(&truth, &pose_error(&small_motion(rng, 0.05 * world.near, 0.03), &Se3::identity(), 1.0), world.scale);
-    let found = optimise_pose(&PINHOLE, &initial, &observations);
+    let found = optimise_pose(&PINHOLE, &initial, None, &observations);
     let mut outcome = Outcome::default();
     if found.inliers < FEWEST {
         outcome.count("refused", 1);
