@@ -5,7 +5,7 @@
 
 mod adjusting;
 mod closing;
-mod dense_fallback;
+mod dense_prior;
 mod frames;
 mod keyframe_selection;
 mod localising;

@@ -1,5 +1,5 @@
-//! RGB-D frames whose features do not give a pose: all pixels do, for a while. Not across a gap, where a false
-//! minimum looks like a pose.
+//! RGB-D frames with few landmarks: the alignment of all pixels is a prior of the pose, and without landmarks the pose. Not across a gap, where a
+//! false minimum looks like a pose.
 
 use std::sync::Arc;
 
@@ -7,8 +7,7 @@ use super::Tracker;
 use crate::geometry::Se3;
 use crate::tracking::front_end::ExtractedFrame;
 use crate::tracking::localisation::dense_alignment::{DenseFrame, align};
-use crate::tracking::localisation::localise::LastFrame;
-use crate::tracking::localisation::localise::{Context, Localised};
+use crate::tracking::localisation::localise::{Context, LastFrame, Localised};
 use crate::tracking::solvers::pose::PosePrior;
 
 /// Frames without a pose after which pixels no longer say where the camera is.
@@ -17,8 +16,8 @@ const MAX_FRAMES_BRIDGED: usize = 2;
 const KEYFRAME_OVERLAP: f64 = 0.5;
 
 impl Tracker {
-    /// The frame's pose from all its pixels, where features did not give it: against the last frame, then against the newest keyframe,
-    /// which drifts less.
+    /// The frame's pose from all its pixels and the landmarks that agree: against the last frame, then against the newest keyframe, which drifts
+    /// less.
     pub(super) fn localise_densely(&mut self, frame: &ExtractedFrame, last: &LastFrame, guess: Option<Se3>) -> Option<Localised> {
         if self.lostness.frames_lost > MAX_FRAMES_BRIDGED {
             return None;
