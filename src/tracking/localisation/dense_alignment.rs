@@ -9,6 +9,7 @@ use nalgebra::{Matrix6, SymmetricEigen, Vector3, Vector6};
 use crate::geometry::{Camera, Pinhole, Se3, se3};
 use crate::sequence::DepthImage;
 use crate::tracking::TrackingConfig;
+use crate::tracking::solvers::pose::PosePrior;
 
 const SCALE: f64 = 0.25;
 /// Halvings of that, coarsest first, with the iterations on each.
@@ -159,6 +160,13 @@ pub struct Aligned {
     pub overlap: f64,
     /// Of a left perturbation (metres, radians).
     pub information: Matrix6<f64>,
+}
+
+impl Aligned {
+    /// What it says of the current pose, given that of the reference.
+    pub fn prior(&self, reference_from_world: &Se3) -> PosePrior {
+        PosePrior { camera_from_world: self.current_from_reference * reference_from_world, information: self.information }
+    }
 }
 
 /// Normal equations of one level at one pose.

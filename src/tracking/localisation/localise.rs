@@ -36,7 +36,7 @@ const MAP_RULES: Rules = Rules { max_distance: 80, ratio: 0.8, check_rotation: f
 const LOCAL_KEYFRAMES: usize = 20;
 const LOCAL_NEAREST: usize = 5;
 const LOCAL_NEIGHBOURS: usize = 5;
-/// Landmarks that hold a pose which pixels hold too.
+/// Inliers from which on landmarks hold a pose that has a prior.
 const HELD_INLIERS: usize = 50;
 /// Keyframes tried when lost.
 const RELOCALISATION_KEYFRAMES: usize = 4;
@@ -185,7 +185,7 @@ impl Context<'_> {
     }
 
     /// From a prior, with the landmarks that agree near it.
-    pub fn near(&mut self, frame: &FrameFeatures, prior: PosePrior, reference: usize) -> Localised {
+    pub fn from_prior(&mut self, frame: &FrameFeatures, prior: PosePrior, reference: usize) -> Localised {
         let blank = Localised {
             camera_from_world: prior.camera_from_world,
             landmarks: vec![None; frame.len()],

@@ -8,7 +8,6 @@ use crate::geometry::Se3;
 use crate::tracking::front_end::ExtractedFrame;
 use crate::tracking::localisation::dense_alignment::{DenseFrame, align};
 use crate::tracking::localisation::localise::{Context, LastFrame, Localised};
-use crate::tracking::solvers::pose::PosePrior;
 
 /// Frames without a pose after which pixels no longer say where the camera is.
 const MAX_FRAMES_BRIDGED: usize = 2;
@@ -25,29 +24,16 @@ impl Tracker {
         let (dense, before) = (frame.dense.as_ref()?, self.dense.last.as_ref()?);
         let mut guesses = vec![self.motion.velocity.unwrap_or_default(), Se3::identity()];
         guesses.extend(guess.map(|pose| pose * last.camera_from_world.inverse()));
-        let found = align(before, dense, &guesses)?;
-        let mut prior = PosePrior {
-            camera_from_world: found.current_from_reference * last.camera_from_world,
-            information: found.information,
-        };
+        let mut prior = align(before, dense, &guesses)?.prior(&last.camera_from_world);
         if let Some((keyframe, view)) = &self.dense.keyframe {
             let pose = self.map.keyframes[*keyframe].camera_from_world;
             let guess = prior.camera_from_world * pose.inverse();
             if let Some(found) = align(view, dense, &[guess]).filter(|found| found.overlap >= KEYFRAME_OVERLAP) {
-                prior = PosePrior { camera_from_world: found.current_from_reference * pose, information: found.information };
+                prior = found.prior(&pose);
             }
         }
         let mut context = Context { map: &mut self.map, rig: &self.rig };
-        Some(context.near(&frame.features, prior, self.motion.reference))
-    }
-
-    /// How many frames are missing between the last one and this, going by the interval before.
-    pub(super) fn missing_before(&mut self, frame: &ExtractedFrame) -> usize {
-        let interval_s = self.arrival.map(|(last_s, _)| (frame.timestamp_s - last_s).abs());
-        let usual_s = self.arrival.and_then(|(_, usual_s)| usual_s).filter(|usual_s| *usual_s > 0.0);
-        self.arrival = Some((frame.timestamp_s, interval_s));
-        let intervals = interval_s.zip(usual_s).map_or(1.0, |(interval_s, usual_s)| (interval_s / usual_s).round());
-        (intervals as usize).saturating_sub(1)
+        Some(context.from_prior(&frame.features, prior, self.motion.reference))
     }
 
     /// Keeps a tracked frame's pixels for the next.

@@ -38,7 +38,7 @@ use crate::tracking::solvers::depth_bias::DepthBias;
 use crate::tracking::worker::Worker;
 use crate::tracking::{KeyframePose, NewKeyframe, StageTimes, TrackedFrame, TrackingConfig, TrackingError, TrackingState};
 
-/// With fewer landmarks than this, all pixels hold a pose too, where there is depth.
+/// Below this many inliers, the alignment of all pixels is a prior of the pose, where there is depth.
 const FEW_INLIERS: usize = 100;
 /// Without depth, keyframes further apart are worth more: a window then spans a wider baseline, which is all that fixes the points.
 const MONO_SPACING: f64 = 1.65;

@@ -19,6 +19,15 @@ const LOST_AFTER_S: f64 = 1.0;
 const APART_DEPTHS: f64 = 100.0;
 
 impl Tracker {
+    /// How many frames are missing between the last one and this, going by the interval before.
+    pub(super) fn missing_before(&mut self, frame: &ExtractedFrame) -> usize {
+        let interval_s = self.arrival.map(|(last_s, _)| (frame.timestamp_s - last_s).abs());
+        let usual_s = self.arrival.and_then(|(_, usual_s)| usual_s).filter(|usual_s| *usual_s > 0.0);
+        self.arrival = Some((frame.timestamp_s, interval_s));
+        let intervals = interval_s.zip(usual_s).map_or(1.0, |(interval_s, usual_s)| (interval_s / usual_s).round());
+        (intervals as usize).saturating_sub(1)
+    }
+
     /// A frame without a pose: after a while it begins a new submap.
     pub(super) fn lose(
         &mut self,
