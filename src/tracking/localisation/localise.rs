@@ -185,7 +185,7 @@ impl Context<'_> {
     }
 
     /// From a prior, with the landmarks that agree near it.
-    pub fn from_prior(&mut self, frame: &FrameFeatures, prior: PosePrior, reference: usize) -> Localised {
+    pub fn with_prior(&mut self, frame: &FrameFeatures, prior: PosePrior, reference: usize) -> Localised {
         let blank = Localised {
             camera_from_world: prior.camera_from_world,
             landmarks: vec![None; frame.len()],

@@ -33,7 +33,7 @@ impl Tracker {
             }
         }
         let mut context = Context { map: &mut self.map, rig: &self.rig };
-        Some(context.from_prior(&frame.features, prior, self.motion.reference))
+        Some(context.with_prior(&frame.features, prior, self.motion.reference))
     }
 
     /// Keeps a tracked frame's pixels for the next.
