@@ -9,10 +9,10 @@ use nalgebra::Vector2;
 
 use crate::geometry::Camera;
 use crate::sequence::{DepthImage, Frame, Sensor};
+use crate::tracking::features::dense_frame::{DenseFrame, DenseSampler};
 use crate::tracking::features::frame_features::{Feature, FrameFeatures};
 use crate::tracking::features::orb::{Extractor, Keypoint};
 use crate::tracking::features::stereo::disparities;
-use crate::tracking::localisation::dense_alignment::{DenseFrame, DenseSampler};
 use crate::tracking::{TrackingConfig, TrackingError};
 
 /// Nearest depth that a stereo pair measures, in baselines.

@@ -1,5 +1,6 @@
 //! ORB keypoints and descriptors of a frame, their depths, and matching.
 
+pub mod dense_frame;
 pub mod descriptor;
 pub mod frame_features;
 pub mod matching;

@@ -2,16 +2,13 @@
 //!
 //! Point-to-plane distances under projective association (Chen & Medioni 1992; Newcombe et al., *KinectFusion*, ISMAR 2011) and
 //! brightness differences (Steinbrücker et al. 2011; Kerl et al. 2013) are minimised together, coarse to fine, with robust weights.
-//! Images are held at a quarter of the recorded size, without lens distortion.
 
 use nalgebra::{Matrix6, SymmetricEigen, Vector3, Vector6};
 
-use crate::geometry::{Camera, Pinhole, Se3, se3};
-use crate::sequence::DepthImage;
-use crate::tracking::TrackingConfig;
+use crate::geometry::{Pinhole, Se3, se3};
+use crate::tracking::features::dense_frame::DenseFrame;
 use crate::tracking::solvers::pose::PosePrior;
 
-const SCALE: f64 = 0.25;
 /// Halvings of that, coarsest first, with the iterations on each.
 const LEVELS: [(u32, usize); 4] = [(3, 20), (2, 16), (1, 12), (0, 10)];
 /// Standard deviations of inverse depth among neighbouring pixels (1/metres; less than a lone keypoint's, which may lie on an edge), and of
@@ -35,53 +32,6 @@ const MIN_RESEMBLANCE: f64 = 0.6;
 const MIN_INFORMATION: f64 = 0.05;
 /// Neighbouring pixels err together: so many say as much as one.
 const ERRING_TOGETHER: f64 = 300.0;
-
-/// A frame for dense alignment, `[height * width]` each.
-#[derive(Clone, Debug)]
-pub struct DenseFrame {
-    pinhole: Pinhole,
-    /// Metres, 0 where unknown.
-    depth: Vec<f64>,
-    grey: Vec<f64>,
-}
-
-/// Where each pixel of the dense image lies in the recorded one, row-major.
-#[derive(Clone, Debug)]
-pub struct DenseSampler {
-    pinhole: Pinhole,
-    sources: Vec<Option<(u32, u32)>>,
-}
-
-impl DenseSampler {
-    pub fn new(camera: &Camera) -> Self {
-        let pinhole = camera.pinhole.scaled(SCALE);
-        let full = &camera.pinhole;
-        let source = |i: u32| {
-            let ray = pinhole.unproject(&nalgebra::Vector2::new(f64::from(i % pinhole.width), f64::from(i / pinhole.width)), 1.0);
-            let pixel = camera.distort_pixel(&full.project(&ray)?);
-            full.contains(&pixel, 2.0).then(|| (pixel.x.round() as u32, pixel.y.round() as u32))
-        };
-        Self { sources: (0..pinhole.width * pinhole.height).map(source).collect(), pinhole }
-    }
-
-    /// Takes the samples of a frame: brightness as the mean of 4×4 pixels, depth as it is.
-    pub fn sample(&self, grey: &[u8], depth: &DepthImage, config: &TrackingConfig) -> DenseFrame {
-        let width = depth.width as usize;
-        let mean = |(x, y): (u32, u32)| {
-            let rows = (y as usize - 1..=y as usize + 2).map(|v| &grey[v * width + x as usize - 1..=v * width + x as usize + 2]);
-            rows.flatten().map(|g| f64::from(*g)).sum::<f64>() / 16.0
-        };
-        let metres = |(x, y): (u32, u32)| {
-            let found = depth.at(x, y).map(f64::from).unwrap_or_default();
-            if found >= config.min_depth_metres && found <= config.max_depth_metres { found } else { 0.0 }
-        };
-        DenseFrame {
-            pinhole: self.pinhole,
-            depth: self.sources.iter().map(|s| s.map_or(0.0, metres)).collect(),
-            grey: self.sources.iter().map(|s| s.map_or(0.0, mean)).collect(),
-        }
-    }
-}
 
 /// A level of a dense frame with what follows from it.
 struct Level {
@@ -111,9 +61,9 @@ impl Level {
         for i in 0..width * height {
             let (x, y) = (i % width, i / width);
             let block = || (0..step).flat_map(move |v| (0..step).map(move |u| (y * step + v) * full + x * step + u));
-            grey.push(block().map(|s| frame.grey[s]).sum::<f64>() / (step * step) as f64);
+            grey.push(block().map(|s| f64::from(frame.grey[s])).sum::<f64>() / (step * step) as f64);
             // The nearest depth of the block: a mean would invent points between surfaces.
-            let nearest = block().map(|s| frame.depth[s]).filter(|d| *d > 0.0).min_by(f64::total_cmp);
+            let nearest = block().map(|s| f64::from(frame.depth[s])).filter(|d| *d > 0.0).min_by(f64::total_cmp);
             points.push(nearest.map(|d| pinhole.unproject(&nalgebra::Vector2::new(x as f64, y as f64), d)));
         }
         let normals = (0..points.len()).map(|i| normal(&points, i, width)).collect();
@@ -323,7 +273,10 @@ fn brightness_offset(reference: &Level, current: &Level, pose: &Se3) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::Distortion;
+    use crate::geometry::{Camera, Distortion};
+    use crate::sequence::DepthImage;
+    use crate::tracking::TrackingConfig;
+    use crate::tracking::features::dense_frame::{DenseSampler, SCALE};
     use crate::tracking::solvers::residual::tests::PINHOLE;
     use nalgebra::{Point3, Vector2};
 

@@ -2,17 +2,18 @@
 //! *ORB-SLAM3*, 2021, sec. VI, whose idea it is to confirm a loop by the keyframe's neighbours at once instead of waiting).
 //!
 //! A false loop ruins a map and a missed one only leaves its drift, so each step may refuse: the place must resemble the keyframe about
-//! as much as its own neighbours do, the landmarks must align rigidly, most of what should be seen must be seen, neighbours must agree,
-//! and the correction must be one that drift can explain.
+//! as much as its own neighbours do, the landmarks must align rigidly, most of what should be seen must be seen, neighbours or all pixels
+//! must agree, and the correction must be one that drift can explain.
 
 use nalgebra::Point3;
 
 use crate::geometry::{Se3, Sim3};
 use crate::tracking::features::matching::{Rules, match_all};
 use crate::tracking::features::projection::{PointMatch, ProjectionSearch};
+use crate::tracking::localisation::dense_alignment::align;
 use crate::tracking::map::sparse_map::{Keyframe, Map};
 use crate::tracking::rig::Rig;
-use crate::tracking::solvers::pose::{PoseObservation, optimise_pose};
+use crate::tracking::solvers::pose::{PoseObservation, PosePrior, optimise_pose};
 use crate::tracking::solvers::residual::InlierClass;
 use crate::tracking::solvers::sim3_alignment::{Pair, align_pairs};
 
@@ -35,6 +36,8 @@ const PROJECTION_SEARCH: ProjectionSearch =
 const MIN_INLIERS_EACH: usize = 20;
 const MIN_INLIERS: usize = 90;
 const MIN_FOUND_SHARE: f64 = 0.1;
+/// Share of the place's pixels that must agree, where pixels confirm it instead of neighbours.
+const MIN_OVERLAP: f64 = 0.5;
 /// Neighbours of the keyframe that are searched for the place, and how many of them must confirm it.
 const NEIGHBOURS_SEARCHED: usize = 4;
 const NEIGHBOURS_CONFIRMING: usize = 2;
@@ -118,12 +121,26 @@ impl Search<'_> {
 
     /// Makes sure that `keyframe` shows `place`, or a place that looks just like it.
     pub fn recognise(&self, keyframe: usize, place: usize) -> Option<Recognised> {
-        let aligned = self.align(keyframe, place)?;
         let mut around = vec![place];
         around.extend(self.connected(place).into_iter().filter(|k| self.is_old(*k, keyframe)).take(PLACE_NEIGHBOURS));
         let landmarks = self.map.landmarks_of(&around);
-        let rough = aligned * Sim3::from(self.map.keyframes[place].camera_from_world);
-        let seen = self.search_in(&landmarks, keyframe, &rough.to_rigid());
+        let aligned = self.align(keyframe, place);
+        let by_neighbours = aligned.and_then(|aligned| self.confirm_by_neighbours(keyframe, place, &landmarks, &aligned));
+        let (corrected, matches) = by_neighbours.or_else(|| self.confirm_by_pixels(keyframe, place, &landmarks, aligned))?;
+        Some(Recognised { keyframe, place, corrected, matches, landmarks })
+    }
+
+    /// Where a keyframe ought to be, and the landmarks of the place that it shows, if its neighbours show them too. `aligned` is
+    /// keyframe_from_place.
+    fn confirm_by_neighbours(
+        &self,
+        keyframe: usize,
+        place: usize,
+        landmarks: &[usize],
+        aligned: &Sim3,
+    ) -> Option<(Sim3, Vec<(usize, usize)>)> {
+        let rough = *aligned * Sim3::from(self.map.keyframes[place].camera_from_world);
+        let seen = self.search_in(landmarks, keyframe, &rough.to_rigid(), None);
         if seen.matches.len() < MIN_INLIERS_EACH {
             return None;
         }
@@ -133,7 +150,7 @@ impl Search<'_> {
             // The neighbours' motion in the place's unit.
             let mut motion = neighbour_from_keyframe;
             motion.translation.vector /= rough.scale;
-            self.search_in(&landmarks, *neighbour, &(motion * seen.camera_from_world))
+            self.search_in(landmarks, *neighbour, &(motion * seen.camera_from_world), None)
         };
         let mut confirming: Vec<Seen> = self.connected(keyframe).iter().take(NEIGHBOURS_SEARCHED).map(in_neighbour).collect();
         confirming.sort_by_key(|seen| std::cmp::Reverse(seen.matches.len()));
@@ -150,7 +167,28 @@ impl Search<'_> {
             translation: seen.camera_from_world.translation.vector * rough.scale,
             scale: rough.scale,
         };
-        confirmed.then_some(Recognised { keyframe, place, corrected, matches: seen.matches, landmarks })
+        confirmed.then_some((corrected, seen.matches))
+    }
+
+    /// The same where landmarks are few, if all pixels agree with them: those of a wall fit elsewhere too, and so do a few landmarks.
+    fn confirm_by_pixels(
+        &self,
+        keyframe: usize,
+        place: usize,
+        landmarks: &[usize],
+        aligned: Option<Sim3>,
+    ) -> Option<(Sim3, Vec<(usize, usize)>)> {
+        let (here, there) = (&self.map.keyframes[keyframe], &self.map.keyframes[place]);
+        let (now, before) = (here.dense.as_ref()?, there.dense.as_ref()?);
+        let guesses = aligned.map(|aligned| aligned.to_rigid()).into_iter().chain([Se3::identity()]);
+        let seen_from = |guess: Se3| {
+            let prior = align(before, now, &[guess]).filter(|found| found.overlap >= MIN_OVERLAP)?.prior(&there.camera_from_world);
+            let seen = self.search_in(landmarks, keyframe, &prior.camera_from_world, Some(&prior));
+            let found = seen.matches.len();
+            let enough = found >= MIN_INLIERS_EACH && found as f64 >= MIN_FOUND_SHARE * seen.expected as f64;
+            enough.then(|| (Sim3::from(seen.camera_from_world), seen.matches))
+        };
+        guesses.filter_map(seen_from).next()
     }
 
     /// The point that a feature shows: its landmark, or where its depth was measured.
@@ -178,7 +216,7 @@ impl Search<'_> {
     }
 
     /// Looks for landmarks in a keyframe as if it were at `camera_from_world`, and improves that pose by what it finds.
-    fn search_in(&self, landmarks: &[usize], keyframe: usize, camera_from_world: &Se3) -> Seen {
+    fn search_in(&self, landmarks: &[usize], keyframe: usize, camera_from_world: &Se3, prior: Option<&PosePrior>) -> Seen {
         let features = &self.map.keyframes[keyframe].features;
         let visible = self.map.visible(landmarks.iter().copied(), camera_from_world, self.rig);
         let found = PROJECTION_SEARCH.run(features, &visible, |_| PROJECTION_RADIUS, self.rig);
@@ -187,7 +225,7 @@ impl Search<'_> {
             measurement: self.rig.measurement(&features.features[m.feature]),
         };
         let observations: Vec<PoseObservation> = found.iter().map(observation).collect();
-        let estimate = optimise_pose(&self.rig.pinhole, camera_from_world, None, &observations);
+        let estimate = optimise_pose(&self.rig.pinhole, camera_from_world, prior, &observations);
         let good = found.iter().zip(&estimate.classes).filter(|(_, class)| **class != InlierClass::Outlier);
         let matches = good.map(|(m, _)| (m.point, m.feature)).collect();
         Seen { camera_from_world: estimate.camera_from_world, matches, expected: visible.len() }

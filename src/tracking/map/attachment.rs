@@ -47,6 +47,7 @@ impl Map {
         let given_up = &mut self.keyframes[keyframe];
         let features = std::mem::replace(&mut given_up.features, nothing);
         (given_up.links, given_up.landmarks) = (Vec::new(), Vec::new());
+        self.dense_bytes -= given_up.dense.take().map_or(0, |dense| dense.bytes());
         self.database.remove(keyframe, &features.features);
         self.living.remove(&keyframe);
         self.features -= features.len();

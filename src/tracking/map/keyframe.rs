@@ -5,6 +5,7 @@ use std::sync::Arc;
 use nalgebra::Point3;
 
 use crate::geometry::Se3;
+use crate::tracking::features::dense_frame::DenseFrame;
 use crate::tracking::features::frame_features::FrameFeatures;
 use crate::tracking::map::sparse_map::Map;
 
@@ -24,6 +25,8 @@ pub struct Keyframe {
     /// Older keyframes that share most landmarks with it and how many, strongest first, as of its last bundle adjustment.
     pub links: Vec<(usize, usize)>,
     pub features: Arc<FrameFeatures>,
+    /// Its pixels: where landmarks are few, and of the first in a submap, if there is depth.
+    pub dense: Option<Arc<DenseFrame>>,
     /// The landmark that each feature shows.
     pub landmarks: Vec<Option<usize>>,
 }
@@ -49,6 +52,7 @@ impl Keyframe {
             links: Vec::new(),
             landmarks: vec![None; features.len()],
             features,
+            dense: None,
         }
     }
 

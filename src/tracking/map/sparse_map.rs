@@ -42,9 +42,10 @@ pub struct Map {
     pub corrections: usize,
     /// First keyframes of submaps that have not joined another.
     pub roots: BTreeSet<usize>,
-    /// Keyframes that have not been culled, and how many features they hold.
+    /// Keyframes that have not been culled, how many features they hold, and bytes of their pixels.
     pub living: BTreeSet<usize>,
     pub(super) features: usize,
+    pub(super) dense_bytes: usize,
     /// Landmarks on probation and the keyframes that made them, oldest first.
     pub probation: VecDeque<(usize, usize)>,
     /// Landmarks that are no more, and the number of keyframes when they ended, oldest first: their places are used again.
@@ -83,6 +84,7 @@ impl Map {
         self.database.insert(id, &keyframe.features.features);
         self.living.insert(id);
         self.features += keyframe.features.len();
+        self.dense_bytes += keyframe.dense.as_ref().map_or(0, |dense| dense.bytes());
         if keyframe.root == id {
             self.roots.insert(id);
         }
@@ -194,9 +196,9 @@ impl Map {
         l.state == LandmarkState::Alive && l.first_keyframe < known
     }
 
-    /// Host memory of what tracking keeps of keyframes and landmarks, bytes, by their number.
+    /// Host memory of what tracking keeps of keyframes and landmarks, bytes, by their number and pixels.
     pub fn bytes(&self) -> u64 {
-        (self.features * BYTES_PER_FEATURE + self.landmarks.len() * BYTES_PER_LANDMARK) as u64
+        (self.features * BYTES_PER_FEATURE + self.landmarks.len() * BYTES_PER_LANDMARK + self.dense_bytes) as u64
     }
 
     /// `from` is the same point as `into`, which takes over its observations.

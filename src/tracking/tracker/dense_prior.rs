@@ -5,8 +5,9 @@ use std::sync::Arc;
 
 use super::Tracker;
 use crate::geometry::Se3;
+use crate::tracking::features::dense_frame::DenseFrame;
 use crate::tracking::front_end::ExtractedFrame;
-use crate::tracking::localisation::dense_alignment::{DenseFrame, align};
+use crate::tracking::localisation::dense_alignment::align;
 use crate::tracking::localisation::localise::{Context, LastFrame, Localised};
 
 /// Frames without a pose after which pixels no longer say where the camera is.

@@ -25,9 +25,9 @@ use localising::FRESHLY_FOUND_FRAMES;
 use crate::geometry::{Camera, Se3, StampedPose};
 use crate::sequence::{Frame, Sensor};
 use crate::tracking::adjustment::local_bundle::Adjustment;
+use crate::tracking::features::dense_frame::DenseFrame;
 use crate::tracking::front_end::{ExtractedFrame, FrontEnd};
 use crate::tracking::initialisation::mono::FirstView;
-use crate::tracking::localisation::dense_alignment::DenseFrame;
 use crate::tracking::localisation::localise::{LastFrame, Localised};
 use crate::tracking::loop_closing::{ClosedLoop, LoopCloser};
 use crate::tracking::map::insertion;
@@ -40,6 +40,8 @@ use crate::tracking::{KeyframePose, NewKeyframe, StageTimes, TrackedFrame, Track
 
 /// Below this many inliers, the alignment of all pixels is a prior of the pose, where there is depth.
 const FEW_INLIERS: usize = 100;
+/// Keyframes with fewer inliers keep their pixels, by which a place is recognised.
+const PIXELS_KEPT_BELOW: usize = 200;
 /// Without depth, keyframes further apart are worth more: a window then spans a wider baseline, which is all that fixes the points.
 const MONO_SPACING: f64 = 1.65;
 
@@ -275,6 +277,7 @@ impl Tracker {
         let due =
             may_be_keyframe && keyframe_selection::is_due(&self.map, &features, &found, self.motion.reference, &self.rig.config);
         let is_held = found.is_held();
+        let dense = frame.dense.clone().filter(|_| found.inliers < PIXELS_KEPT_BELOW);
         let Localised { camera_from_world, landmarks, inliers, .. } = found;
         let camera_from_reference = self.map.keyframes[self.motion.reference].relative(&camera_from_world);
         let sightings = if is_held { Sightings::new(&features, &landmarks, &self.map, &self.rig) } else { Sightings::default() };
@@ -286,7 +289,7 @@ impl Tracker {
         let image_due = may_be_keyframe && !due && is_held && self.is_image_due(motion);
         self.motion.last = Some(LastFrame { features, camera_from_world, landmarks });
         let new_keyframe = match (due, image_due) {
-            (true, _) => self.make_keyframe(frame, is_held, &mut times)?,
+            (true, _) => self.make_keyframe(frame, dense, is_held, &mut times)?,
             (false, true) => self.make_image_only(),
             (false, false) => None,
         };
@@ -300,10 +303,11 @@ impl Tracker {
         })
     }
 
-    /// Makes the frame that was just tracked a keyframe. `held`: by landmarks, instead of by all pixels.
+    /// Makes the frame that was just tracked a keyframe. `dense`: its pixels, where landmarks are few. `held`: by landmarks, instead of by all pixels.
     fn make_keyframe(
         &mut self,
         frame: &ExtractedFrame,
+        dense: Option<Arc<DenseFrame>>,
         held: bool,
         times: &mut StageTimes,
     ) -> Result<Option<NewKeyframe>, TrackingError> {
@@ -312,7 +316,7 @@ impl Tracker {
         let clock = Instant::now();
         let root = self.map.keyframes[self.motion.reference].root;
         let keyframe = Keyframe::new(frame.index, frame.timestamp_s, camera_from_world, features.clone());
-        let keyframe = Keyframe { root, landmarks, ..keyframe };
+        let keyframe = Keyframe { root, landmarks, dense, ..keyframe };
         let id = insertion::insert_keyframe(&mut self.map, keyframe, &self.rig);
         triangulation::triangulate_with_neighbours(&mut self.map, id, &self.rig);
         insertion::fuse_with_neighbours(&mut self.map, id, &self.rig);

@@ -20,7 +20,7 @@ impl Tracker {
         }
         let camera_from_world = self.next_submap().inverse();
         let keyframe = Keyframe::new(frame.index, frame.timestamp_s, camera_from_world, features.clone());
-        let keyframe = Keyframe { root: self.map.keyframes.len(), ..keyframe };
+        let keyframe = Keyframe { root: self.map.keyframes.len(), dense: frame.dense.clone(), ..keyframe };
         let id = insertion::insert_keyframe(&mut self.map, keyframe, &self.rig);
         let landmarks = self.map.keyframes[id].landmarks.clone();
         self.record(frame, id, Se3::identity(), Sightings::default());
