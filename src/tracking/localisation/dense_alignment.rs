@@ -271,7 +271,7 @@ fn brightness_offset(reference: &Level, current: &Level, pose: &Se3) -> f64 {
 }
 
 #[cfg(test)]
-mod tests {
+pub mod tests {
     use super::*;
     use crate::geometry::{Camera, Distortion};
     use crate::sequence::DepthImage;
@@ -287,7 +287,7 @@ mod tests {
     };
 
     /// A room's corner: three planes, grey with soft stripes. The nearest hit along each pixel's line of sight.
-    fn corner(camera_from_world: &Se3) -> DenseFrame {
+    pub fn corner(camera_from_world: &Se3) -> DenseFrame {
         let world_from_camera = camera_from_world.inverse();
         let eye = world_from_camera * Point3::origin();
         let mut metres = vec![0.0f32; 640 * 480];

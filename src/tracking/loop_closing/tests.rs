@@ -2,14 +2,16 @@
 
 use std::sync::Arc;
 
-use nalgebra::{Point3, Vector3};
+use nalgebra::{Point3, Vector3, Vector6};
 
 use crate::geometry::sim3::{self, Vector7};
-use crate::geometry::{Se3, Sim3, align};
+use crate::geometry::{Se3, Sim3, align, se3};
 use crate::tracking::TrackingConfig;
 use crate::tracking::adjustment::local_bundle::Adjustment;
+use crate::tracking::features::dense_frame::DenseFrame;
 use crate::tracking::features::descriptor::Descriptor;
 use crate::tracking::features::frame_features::{Feature, FrameFeatures};
+use crate::tracking::localisation::dense_alignment::tests::corner;
 use crate::tracking::loop_closing::{LoopCloser, MovedKeyframe};
 use crate::tracking::map::sparse_map::{Keyframe, Map, Observation};
 use crate::tracking::rig::Rig;
@@ -174,4 +176,49 @@ fn rotations_stay_rotations_through_any_number_of_corrections() {
     assert!(
         map.keyframes.iter().all(|k| (k.camera_from_world.rotation.norm() - 1.0).abs() < 1e-12 && k.centre().coords.norm() < 1e3)
     );
+}
+
+/// Two submaps of one keyframe each, at the world's origin and at `second`, in front of a wall of the room of [`corner`]; they have `shared` points in
+/// common.
+fn one_keyframe_each(second: &Se3, shared: usize, pixels: Option<[DenseFrame; 2]>, config: &TrackingConfig) -> Map {
+    let mut random = fastrand::Rng::with_seed(3);
+    let mut point = || (Point3::new(1.6 * random.f64() - 1.0, 1.2 * random.f64() - 0.6, 3.0), Descriptor([random.u64(..); 4]));
+    let wall: Vec<(Point3<f64>, Descriptor)> = (0..shared + 60).map(|_| point()).collect();
+    let submap = |pose: &Se3, points: &[(Point3<f64>, Descriptor)], dense: Option<DenseFrame>| {
+        let feature = |(p, descriptor): &(Point3<f64>, Descriptor)| {
+            let p_in_camera = (pose * p).coords;
+            let pixel = PINHOLE.project(&p_in_camera).unwrap();
+            let depth_metres = Some(p_in_camera.z);
+            Feature { pixel, octave: 2, angle_rad: 0.0, depth_metres, inverse_depth_sigma: 0.025, descriptor: *descriptor }
+        };
+        let features = Arc::new(FrameFeatures::new(points.iter().map(feature).collect(), &PINHOLE));
+        let mut map = Map::default();
+        map.push(Keyframe { dense: dense.map(Arc::new), ..Keyframe::new(0, 0.0, Se3::identity(), features) });
+        for (feature, (p, _)) in points.iter().enumerate() {
+            map.add_landmark(Observation { keyframe: 0, feature }, pose * p, config);
+        }
+        map
+    };
+    let [first, again] = pixels.map_or([None, None], |pixels| pixels.map(Some));
+    let mut map = submap(&Se3::identity(), &wall[..shared + 30], first);
+    let [common, own] = [&wall[..shared], &wall[shared + 30..]];
+    map.append(submap(second, &[common, own].concat(), again), &Se3::translation(300.0, 0.0, 0.0), config);
+    map
+}
+
+#[test]
+fn pixels_confirm_a_place_that_no_neighbour_shows() {
+    let config = TrackingConfig::default();
+    let second = se3::exp(&Vector6::new(0.12, -0.06, 0.1, 0.04, -0.07, 0.05));
+    let elsewhere = se3::exp(&Vector6::new(0.0, 0.0, 0.0, 0.0, 2.4, 0.0));
+    let of = |pose: &Se3| Some([corner(&Se3::identity()), corner(pose)]);
+    let joined = |shared, pixels| {
+        let mut map = one_keyframe_each(&second, shared, pixels, &config);
+        let moved = close(&mut LoopCloser::default(), &mut map, 1, &config);
+        (!moved.is_empty()).then(|| se3::log(&(map.keyframes[1].camera_from_world * second.inverse())).norm())
+    };
+    assert!(joined(40, of(&second)).is_some_and(|off| off < 5e-3));
+    assert!(joined(12, of(&second)).is_none(), "too few landmarks");
+    assert!(joined(40, of(&elsewhere)).is_none(), "pixels of another place");
+    assert!(joined(40, None).is_none(), "neither pixels nor neighbours");
 }
