@@ -16,8 +16,8 @@ const MAX_FRAMES_BRIDGED: usize = 2;
 const KEYFRAME_OVERLAP: f64 = 0.5;
 
 impl Tracker {
-    /// The frame's pose from all its pixels and the landmarks that agree: against the last frame, then against the newest keyframe if that is another,
-    /// for it drifts less.
+    /// The frame's pose from all its pixels and the landmarks that agree: against the last frame, then against the newest keyframe, which drifts
+    /// less, and once more where that is the last frame: the best of three guesses may be a false minimum.
     pub(super) fn localise_densely(&mut self, frame: &ExtractedFrame, last: &LastFrame, guess: Option<Se3>) -> Option<Localised> {
         if self.lostness.frames_lost > MAX_FRAMES_BRIDGED {
             return None;
@@ -26,7 +26,7 @@ impl Tracker {
         let mut guesses = vec![self.motion.velocity.unwrap_or_default(), Se3::identity()];
         guesses.extend(guess.map(|pose| pose * last.camera_from_world.inverse()));
         let mut prior = align(before, dense, &guesses)?.prior(&last.camera_from_world);
-        if let Some((keyframe, view)) = self.dense.keyframe.as_ref().filter(|(_, view)| !Arc::ptr_eq(view, before)) {
+        if let Some((keyframe, view)) = &self.dense.keyframe {
             let pose = self.map.keyframes[*keyframe].camera_from_world;
             let guess = prior.camera_from_world * pose.inverse();
             if let Some(found) = align(view, dense, &[guess]).filter(|found| found.overlap >= KEYFRAME_OVERLAP) {
