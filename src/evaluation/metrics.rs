@@ -58,6 +58,9 @@ pub struct Metrics {
     /// Systematic error of the depth images that the tracker found.
     #[serde(default)]
     pub depth_bias: Option<DepthBiasFigures>,
+    /// Standard deviation of keypoints at the finest pyramid level that the tracker found, pixels.
+    #[serde(default)]
+    pub pixel_sigma: Option<f64>,
     /// Figures of the optimisation.
     pub mapping: Option<MappingFigures>,
     /// Peak resident memory of the process, bytes.

@@ -144,6 +144,7 @@ fn gather(
         frames_late: read.late,
         keyframes_deferred: track.deferred,
         depth_bias: track.depth_bias,
+        pixel_sigma: track.pixel_sigma,
         step_ms: map.step_ms,
         paging: map.paging,
         wall_s,

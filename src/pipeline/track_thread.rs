@@ -27,6 +27,7 @@ pub(super) struct TrackSummary {
     /// Real time: keyframes that the mapper never received.
     pub deferred: usize,
     pub depth_bias: Option<DepthBias>,
+    pub pixel_sigma: Option<f64>,
     pub error: Option<PipelineError>,
 }
 
@@ -167,6 +168,7 @@ impl TrackThread<'_> {
         summary.keyframes = tracker.keyframes();
         summary.images = tracker.image_only_keyframes();
         summary.depth_bias = tracker.depth_bias();
+        summary.pixel_sigma = Some(tracker.pixel_sigma());
         summary.loops = loops(&tracker);
         self.progress.poses().put(poses(&tracker));
         let unjoined = tracker.unjoined_keyframes();

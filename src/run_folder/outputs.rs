@@ -364,6 +364,7 @@ pub fn write_metrics(
         wall_s: Some(result.wall_s),
         resumed: result.resumed,
         tracking_ms: Times::of(&result.tracking_ms),
+        pixel_sigma: result.pixel_sigma,
         depth_bias: result.depth_bias.map(|DepthBias(bias)| DepthBiasFigures {
             offset_per_m: bias.x,
             tilt_x_per_m: bias.y,

@@ -33,6 +33,8 @@ pub struct RunResult {
     pub keyframes_deferred: usize,
     /// Systematic error of the depth images, if it was estimated.
     pub depth_bias: Option<DepthBias>,
+    /// Standard deviation of keypoints as the tracker left it, pixels; `None` with known poses.
+    pub pixel_sigma: Option<f64>,
     /// Tracking time of each frame, milliseconds.
     pub tracking_ms: Vec<f64>,
     /// Duration of each optimisation step, milliseconds.

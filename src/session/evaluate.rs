@@ -142,6 +142,7 @@ fn foreign_metrics(recording: &Recording) -> Metrics {
         resumed: 0,
         tracking_ms: None,
         depth_bias: None,
+        pixel_sigma: None,
         mapping: None,
         peak_host_bytes: None,
         peak_gpu_bytes: None,

@@ -29,6 +29,8 @@ pub struct TrackingConfig {
     pub max_depth_metres: f64,
     /// Standard deviation of a keypoint's position at the finest pyramid level, pixels. Coarser levels scale it.
     pub pixel_sigma: f64,
+    /// Whether residuals may lower it, down to a half.
+    pub pixel_noise: bool,
     /// Standard deviation of measured inverse depth, 1/metres. A structured-light sensor measures disparity with constant noise,
     /// so its depth noise grows as `inverse_depth_sigma * depth²`.
     pub inverse_depth_sigma: f64,
@@ -76,6 +78,7 @@ impl Default for TrackingConfig {
             min_depth_metres: 0.2,
             max_depth_metres: 6.0,
             pixel_sigma: 1.0,
+            pixel_noise: true,
             inverse_depth_sigma: 0.025,
             depth_bias: true,
             disparity_sigma: 1.4,

@@ -198,7 +198,7 @@ fn adjust(
         for (pose, observation) in seen {
             let frame = recorded[&map.keyframes[observation.keyframe].frame_index];
             let feature = &frame.features.features[observation.feature];
-            let weight = feature.measurement(config).pixel_weight;
+            let weight = 1.0 / (config.pixel_sigma * config.pyramid_scale.powi(feature.octave.into()));
             problem.observations.push(PixelObservation {
                 pose,
                 point: problem.points.len(),

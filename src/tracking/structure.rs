@@ -108,7 +108,7 @@ fn points_of(views: &[PosedView], candidates: &[Candidates<'_>], index: usize, r
     let mut depths: Vec<Vec<Depth>> = vec![Vec::new(); view.features.len()];
     for other in neighbours(views, index) {
         for MatchedPoint { mine, point, parallax_cosine, .. } in match_along_lines(&candidates[index], &candidates[other], rig) {
-            let sigma_rad = rig.config.pixel_sigma * rig.octave_scale(view.features[mine].octave) / rig.pinhole.fx;
+            let sigma_rad = rig.pixel_sigma(view.features[mine].octave) / rig.pinhole.fx;
             depths[mine].push(Depth { z: (view.camera_from_world * point).z, sigma: sigma_rad / parallax_cosine.acos() });
         }
     }

@@ -12,7 +12,7 @@ const EXAMPLE: &str = r#"{ "sequence": "redkitchen", "sensor": "rgbd", "paced": 
              "monogs":     {"count": 110, "psnr_db": 24.1, "ssim": 0.85, "depth_l1_m": 0.02}},
   "gaussians": 60000, "map_bytes": 3000000, "map_hash": "00ff",
   "wall_s": 90.0, "resumed": 0, "tracking_ms": {"median": 20.0, "p95": 30.0, "max": 50.0},
-  "depth_bias": {"offset_per_m": 0.001, "tilt_x_per_m": 0.009, "tilt_y_per_m": -0.002},
+  "depth_bias": {"offset_per_m": 0.001, "tilt_x_per_m": 0.009, "tilt_y_per_m": -0.002}, "pixel_sigma": 0.8,
   "mapping": {"iterations": 1800, "iterations_per_frame": 3.0, "ms_per_iteration": {"median": 40.0, "p95": 60.0},
               "map_width": 320, "map_height": 240},
   "peak_host_bytes": 900000000, "peak_gpu_bytes": 200000000,

@@ -185,7 +185,7 @@ fn make_problem(
     for (point, l) in landmarks.iter().enumerate() {
         for observation in &map.landmarks[*l].observations {
             let Some(&pose) = place.get(&observation.keyframe) else { continue };
-            let measurement = map.keyframes[observation.keyframe].features.features[observation.feature].measurement(&rig.config);
+            let measurement = rig.biased_measurement(&map.keyframes[observation.keyframe].features.features[observation.feature]);
             let class = if measurement.inverse_depth.is_some() { InlierClass::Full } else { InlierClass::PixelOnly };
             problem.observations.push(BundleObservation { pose, point, measurement, class });
             observations.push(*observation);

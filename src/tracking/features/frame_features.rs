@@ -3,7 +3,6 @@
 use nalgebra::{Point3, Vector2};
 
 use crate::geometry::Pinhole;
-use crate::tracking::TrackingConfig;
 use crate::tracking::features::descriptor::Descriptor;
 use crate::tracking::rig::Rig;
 use crate::tracking::solvers::residual::Measurement;
@@ -95,12 +94,12 @@ impl FrameFeatures {
 }
 
 impl Feature {
-    /// Measurement with weights from the noise model.
-    pub fn measurement(&self, config: &TrackingConfig) -> Measurement {
+    /// Measurement with weights from the noise model; `pixel_sigma` is the standard deviation of each pixel coordinate.
+    pub fn measurement(&self, pixel_sigma: f64) -> Measurement {
         Measurement {
             pixel: self.pixel,
             inverse_depth: self.depth_metres.map(|d| 1.0 / d),
-            pixel_weight: 1.0 / (config.pixel_sigma * config.pyramid_scale.powi(self.octave.into())),
+            pixel_weight: 1.0 / pixel_sigma,
             depth_weight: if self.depth_metres.is_some() { 1.0 / self.inverse_depth_sigma } else { 0.0 },
         }
     }

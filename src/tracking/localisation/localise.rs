@@ -57,8 +57,9 @@ pub struct Localised {
     /// The landmark that each feature shows.
     pub landmarks: Vec<Option<usize>>,
     pub inliers: usize,
-    /// How many were matched, inliers and outliers.
+    /// How many were matched, inliers and outliers, and the median of their squared pixel residuals, whitened.
     pub matches: usize,
+    pub median_squared: f64,
     /// Whether the pose came without a prediction.
     pub rough: bool,
     /// What all pixels say of it, where landmarks are few.
@@ -191,6 +192,7 @@ impl Context<'_> {
             landmarks: vec![None; frame.len()],
             inliers: 0,
             matches: 0,
+            median_squared: 0.0,
             rough: true,
             prior: Some(prior),
         };
@@ -227,6 +229,7 @@ impl Context<'_> {
             landmarks,
             inliers: estimate.inliers,
             matches: usable.len(),
+            median_squared: estimate.median_squared,
             rough: false,
             prior,
         }

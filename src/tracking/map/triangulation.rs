@@ -5,7 +5,6 @@ use nalgebra::{Matrix3, Point3, Vector2, Vector3};
 
 use crate::geometry::se3::skew;
 use crate::geometry::{Pinhole, Se3};
-use crate::tracking::TrackingConfig;
 use crate::tracking::features::frame_features::Feature;
 use crate::tracking::map::sparse_map::{Keyframe, Map, Observation};
 use crate::tracking::rig::Rig;
@@ -126,13 +125,13 @@ pub fn triangulate_with_neighbours(map: &mut Map, keyframe: usize, rig: &Rig) ->
 
 /// Pairs of the wanted features that show one point; each feature at most once.
 pub fn match_along_lines(this: &Candidates<'_>, other: &Candidates<'_>, rig: &Rig) -> Vec<MatchedPoint> {
-    let Rig { pinhole, config, .. } = rig;
+    let pinhole = &rig.pinhole;
     let fundamental = fundamental(&(other.camera_from_world * this.camera_from_world.inverse()), pinhole);
     let mut taken: Vec<Option<(u32, MatchedPoint)>> = vec![None; other.features.len()];
     for &mine in &this.wanted {
         let feature = &this.features[mine];
         let line = fundamental * feature.pixel.push(1.0);
-        let Some((theirs, distance)) = best_on_line(feature, &line, other, config) else { continue };
+        let Some((theirs, distance)) = best_on_line(feature, &line, other, rig) else { continue };
         let found = &other.features[theirs];
         let Some(met) = triangulate(&this.view(pinhole), &feature.pixel, &other.view(pinhole), &found.pixel) else { continue };
         let agrees = met.parallax_cosine < MAX_PARALLAX_COSINE && {
@@ -148,13 +147,13 @@ pub fn match_along_lines(this: &Candidates<'_>, other: &Candidates<'_>, rig: &Ri
 }
 
 /// The feature of `other` near the line whose descriptor is clearly the most similar.
-fn best_on_line(feature: &Feature, line: &Vector3<f64>, other: &Candidates<'_>, config: &TrackingConfig) -> Option<(usize, u32)> {
+fn best_on_line(feature: &Feature, line: &Vector3<f64>, other: &Candidates<'_>, rig: &Rig) -> Option<(usize, u32)> {
     let norm_squared = line.x * line.x + line.y * line.y;
     let (mut best, mut second) = (None::<(usize, u32)>, u32::MAX);
     for &i in &other.wanted {
         let candidate = &other.features[i];
         let off = line.x * candidate.pixel.x + line.y * candidate.pixel.y + line.z;
-        let sigma = config.pixel_sigma * config.pyramid_scale.powi(candidate.octave.into());
+        let sigma = rig.pixel_sigma(candidate.octave);
         let near = off * off <= CHI2_LINE * sigma * sigma * norm_squared;
         if !near || candidate.octave.abs_diff(feature.octave) > 2 {
             continue;

@@ -49,6 +49,8 @@ pub struct PoseEstimate {
     /// One per observation, in their order.
     pub classes: Vec<InlierClass>,
     pub inliers: usize,
+    /// Median of the squared pixel residuals of all observations in front of the camera, whitened; 0 without a solution.
+    pub median_squared: f64,
 }
 
 /// The pose that explains the observations best, from `initial` (camera_from_world). Without enough to go by, `initial` comes back
@@ -70,6 +72,7 @@ pub fn optimise_pose(
                 camera_from_world: *initial,
                 classes: vec![InlierClass::Outlier; observations.len()],
                 inliers: 0,
+                median_squared: 0.0,
             };
         }
         let converged = if round + 1 == ROUNDS { CONVERGED } else { NEARLY_CONVERGED };
@@ -80,7 +83,14 @@ pub fn optimise_pose(
         }
     }
     let inliers = classes.iter().filter(|t| **t != InlierClass::Outlier).count();
-    PoseEstimate { camera_from_world: pose, classes, inliers }
+    PoseEstimate { camera_from_world: pose, classes, inliers, median_squared: median_squared(pinhole, &pose, observations) }
+}
+
+fn median_squared(pinhole: &Pinhole, pose: &Se3, observations: &[PoseObservation]) -> f64 {
+    let residual = |o: &PoseObservation| o.measurement.residual(pinhole, &(pose * o.point_in_world).coords);
+    let mut squared: Vec<f64> = observations.iter().filter_map(residual).map(|r| r.xy().norm_squared()).collect();
+    let middle = squared.len() / 2;
+    if squared.is_empty() { 0.0 } else { *squared.select_nth_unstable_by(middle, f64::total_cmp).1 }
 }
 
 /// How one round is solved.

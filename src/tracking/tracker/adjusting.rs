@@ -199,7 +199,7 @@ impl Tracker {
         if !self.seeks_bias() {
             return adjustment;
         }
-        let Rig { pinhole, config, depth_bias } = &self.rig;
+        let Rig { pinhole, config, depth_bias, .. } = &self.rig;
         adjustment.with_bias(match self.sensor {
             Sensor::Stereo { baseline_metres } => BiasPrior::of_pair(pinhole.fx * baseline_metres),
             _ => BiasPrior::after(depth_bias, config.inverse_depth_sigma),

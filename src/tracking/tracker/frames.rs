@@ -72,7 +72,7 @@ pub(super) struct Frames {
 impl Sightings {
     pub fn new(features: &FrameFeatures, landmarks: &[Option<usize>], map: &Map, rig: &Rig) -> Self {
         let seen = features.features.iter().zip(landmarks).filter_map(|(feature, landmark)| {
-            let measured = feature.measurement(&rig.config);
+            let measured = rig.biased_measurement(feature);
             Some(Sighting {
                 landmark: u32::try_from((*landmark)?).ok()?,
                 pixel: [measured.pixel.x as f32, measured.pixel.y as f32],

@@ -42,6 +42,8 @@ use crate::tracking::{KeyframePose, NewKeyframe, StageTimes, TrackedFrame, Track
 const FEW_INLIERS: usize = 100;
 /// Keyframes with fewer inliers keep their pixels, by which a place is recognised.
 const PIXELS_KEPT_BELOW: usize = 200;
+/// Frames with fewer inliers say nothing of the noise.
+const NOISE_INLIERS: usize = 30;
 /// Without depth, keyframes further apart are worth more: a window then spans a wider baseline, which is all that fixes the points.
 const MONO_SPACING: f64 = 1.65;
 
@@ -238,6 +240,11 @@ impl Tracker {
         self.seeks_bias().then_some(self.rig.depth_bias)
     }
 
+    /// Standard deviation of a keypoint's coordinates, pixels at the finest pyramid level: as configured, or as the frames so far show it.
+    pub fn pixel_sigma(&self) -> f64 {
+        self.rig.pixel_noise.sigma()
+    }
+
     /// How many keyframes there have been, of all submaps.
     pub fn keyframe_count(&self) -> usize {
         self.map.keyframes.len()
@@ -266,6 +273,9 @@ impl Tracker {
         may_be_keyframe: bool,
         mut times: StageTimes,
     ) -> Result<TrackedFrame, TrackingError> {
+        if self.rig.config.pixel_noise && found.inliers >= NOISE_INLIERS {
+            self.rig.pixel_noise.observe(found.median_squared);
+        }
         self.lostness.frames_since_found = if self.lostness.is_lost { 0 } else { self.lostness.frames_since_found + 1 };
         self.motion.velocity = (!self.lostness.is_lost).then(|| found.camera_from_world * last.camera_from_world.inverse());
         self.lostness.is_lost = false;
