@@ -26,6 +26,7 @@ pub use interlude::Interlude;
 pub use paging::PagedOut;
 pub use refine::{FinalRefinement, RefineReport};
 pub use state::MapperState;
+use stays::Turns;
 use steps::Taken;
 
 use super::anchors::Anchors;
@@ -89,8 +90,7 @@ pub struct Mapper {
     needing: Vec<usize>,
     /// Keyframes that steps can learn from while a part of the map is away, ascending.
     learnable: Vec<usize>,
-    /// Epochs of each keyframe in a final refinement that moves chunks.
-    visits: Vec<u32>,
+    turns: Turns,
     density: DensityPasses,
     keyframes: Vec<MappedKeyframe>,
     /// Images beyond those on the GPU.
@@ -130,7 +130,7 @@ impl Mapper {
             chunks: Chunks::begin(None, false),
             needing: Vec::new(),
             learnable: Vec::new(),
-            visits: Vec::new(),
+            turns: Turns::default(),
             density: DensityPasses::new(&gpu)?,
             keyframes: Vec::new(),
             images: ImageStore::new(config.limits.max_host_bytes),

@@ -15,6 +15,7 @@ use crate::optimise::AdamConfig;
 use crate::splat::model::Dropout;
 
 use super::schedule;
+use super::stays::Turns;
 use super::steps::Taken;
 use super::{BATCH, Interlude, Mapper, Step};
 
@@ -96,10 +97,10 @@ impl FinalRefinement {
         (self.done, planned.map(|steps| steps.max(self.done + self.more)))
     }
 
-    /// The rates for the next step.
-    fn rates(&self) -> AdamConfig {
+    /// The rates at a share of the steps.
+    fn rates(&self, progress: f32) -> AdamConfig {
         let risen = if self.done < self.warm_up { (self.done + 1) as f32 / self.warm_up as f32 } else { 1.0 };
-        let fallen = |to: f32| risen * to.powf(self.progress());
+        let fallen = |to: f32| risen * to.powf(progress);
         self.adam.scaled(fallen(self.config.final_lr_scale_position), fallen(self.config.final_lr_scale))
     }
 }
@@ -139,11 +140,12 @@ impl Mapper {
     }
 
     /// So many steps of the running epoch.
-    fn draw_from_epoch(&mut self, count: usize, coarse: bool) -> Result<Vec<Step>, MappingError> {
+    /// `left`: steps left of the refinement.
+    fn draw_from_epoch(&mut self, count: usize, left: usize, coarse: bool) -> Result<Vec<Step>, MappingError> {
         let mut steps = Vec::with_capacity(count);
         while steps.len() < count {
             if self.epoch.is_empty() {
-                self.epoch = self.next_epoch()?;
+                self.epoch = self.next_epoch(left.saturating_sub(steps.len()))?;
             }
             let Some(keyframe) = self.epoch.pop() else { break };
             // Chunks may have left since the epoch began.
@@ -155,13 +157,19 @@ impl Mapper {
     }
 
     /// Keyframes in the order in which steps learn from them, the last first.
-    fn next_epoch(&mut self) -> Result<Vec<usize>, MappingError> {
-        let stays = !self.visits.is_empty() && !self.chunks.are_here();
-        let mut epoch = if stays { self.next_stay()? } else { self.learnable(self.views()) };
-        if !stays {
-            self.rng.shuffle(&mut epoch);
+    fn next_epoch(&mut self, left: usize) -> Result<Vec<usize>, MappingError> {
+        if self.turns.have_begun() && !self.chunks.are_here() {
+            return self.next_stay(left);
         }
+        self.turns.end_stay();
+        let mut epoch = self.learnable(self.views());
+        self.rng.shuffle(&mut epoch);
         Ok(epoch)
+    }
+
+    /// Share of the steps that Gaussians on the GPU have had, as rates and density control take it.
+    fn progress(&self, refinement: &FinalRefinement) -> f32 {
+        self.turns.progress(self.epoch.len()).unwrap_or_else(|| refinement.progress())
     }
 
     /// Lets each step leave out a share of the Gaussians, others each time.
@@ -190,7 +198,7 @@ impl Mapper {
         // Each Gaussian's own views get their turn.
         self.fix(&[])?;
         self.epoch.clear();
-        self.visits = vec![0; self.keyframes.len()];
+        self.turns = Turns::new(self.keyframes.len(), config.seconds.is_none().then_some(config.steps));
         let mut warm_up = 0;
         if self.has_initial_map {
             // It has the detail that steps at half size would take from it.
@@ -214,22 +222,24 @@ impl Mapper {
             return Ok(None);
         }
         let density = DensityConfig { views: refinement.config.density_views, ..self.config.density.clone() };
-        let density = if refinement.progress() >= growth_share { density.without_growth() } else { density };
-        let mut adam = refinement.rates();
+        let density = if self.progress(refinement) >= growth_share { density.without_growth() } else { density };
+        let mut adam = refinement.rates(self.progress(refinement));
         let mut taken = Taken::default();
         let is_extra = refinement.progress() >= 1.0;
         let left = if is_extra { refinement.more } else { steps - refinement.done };
         let end = refinement.done + density_every.min(left);
         while refinement.done < end && !refinement.is_done() && refinement.interlude(self, interlude)?.is_continue() {
-            let coarse = refinement.progress() < half_size_share;
-            let mut batch = self.draw_from_epoch(BATCH.min(end - refinement.done), coarse)?;
+            let coarse = self.progress(refinement) < half_size_share;
+            let left = if is_extra { refinement.more } else { steps - refinement.done };
+            let mut batch = self.draw_from_epoch(BATCH.min(end - refinement.done), left, coarse)?;
             if batch.is_empty() {
                 refinement.end_here();
                 break;
             }
-            self.drop_out(&mut batch, refinement.config.dropout * refinement.progress());
-            batch.iter_mut().for_each(|step| step.surface_share = refinement.progress());
-            adam = refinement.rates();
+            let progress = self.progress(refinement);
+            self.drop_out(&mut batch, refinement.config.dropout * progress);
+            batch.iter_mut().for_each(|step| step.surface_share = progress);
+            adam = refinement.rates(progress);
             taken += self.steps(&batch, &adam, None)?.0;
             refinement.done += batch.len();
             if is_extra {
@@ -237,7 +247,7 @@ impl Mapper {
             }
         }
         self.refine_exposures(refinement)?;
-        let is_controlled = refinement.progress() < LAST_CONTROL;
+        let is_controlled = self.progress(refinement) < LAST_CONTROL;
         let (pruned, grown) = if is_controlled { self.score_and_control(refinement, &density, &adam)? } else { (0, 0) };
         let (gaussians, psnr_db) = (self.gaussians(), taken.psnr_db());
         Ok(Some(RefineReport { steps_done: refinement.done, pruned, grown, gaussians, psnr_db }))

@@ -7,6 +7,7 @@ use std::time::Duration;
 use fastrand::Rng;
 use serde::{Deserialize, Serialize};
 
+use super::stays::Turns;
 use super::{FinalRefinement, Mapper};
 use crate::gpu::Gpu;
 use crate::mapping::anchors::Anchors;
@@ -24,7 +25,7 @@ pub struct MapperState {
     anchors: Anchors,
     chunks: ChunksState,
     learnable: Vec<usize>,
-    visits: Vec<u32>,
+    turns: Turns,
     stepped_capacity: usize,
     keyframes: Vec<KeyframeState>,
     rng: u64,
@@ -47,7 +48,7 @@ impl Mapper {
             anchors: self.anchors.clone(),
             chunks: self.chunks.state()?,
             learnable: self.learnable.clone(),
-            visits: self.visits.clone(),
+            turns: self.turns.clone(),
             stepped_capacity: self.stepped_capacity,
             keyframes: self.keyframes.iter().map(|keyframe| keyframe.state(&self.gpu, &self.images)).collect::<Result<_, _>>()?,
             rng: self.rng.get_seed(),
@@ -82,7 +83,7 @@ impl Mapper {
         }
         mapper.anchors = state.anchors.clone();
         mapper.learnable = state.learnable.clone();
-        mapper.visits = state.visits.clone();
+        mapper.turns = state.turns.clone();
         mapper.stepped_capacity = state.stepped_capacity;
         mapper.rng = Rng::with_seed(state.rng);
         mapper.step_times = state.step_times.clone();

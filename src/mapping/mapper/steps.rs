@@ -59,7 +59,7 @@ impl Mapper {
             self.keyframes[step.keyframe].offload(&self.gpu, &mut self.images)?;
         }
         // In the final refinement, what reaches into them is taught by its own views in their turn.
-        let mark = if self.visits.is_empty() { HIDDEN } else { 0 };
+        let mark = if self.turns.have_begun() { 0 } else { HIDDEN };
         let streamed = batch
             .iter()
             .zip(hidden)
