@@ -1,4 +1,4 @@
-//! The final refinement of a map larger than the GPU's memory: neighbouring keyframes whose views fit the GPU are refined together for some epochs, with
+//! The final refinement of a map larger than the GPU's memory: neighbouring keyframes whose views fit the GPU are refined together for a while, with
 //! all others that see enough of it, then the next ones.
 
 use std::collections::BTreeSet;
