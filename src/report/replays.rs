@@ -13,6 +13,7 @@ use crate::files::write_atomically;
 const PANEL: (u32, u32) = (420, 320);
 /// Panels in a row of the plot.
 const COLUMNS: usize = 3;
+const BOOTSTRAP_DRAWS: usize = 400;
 
 /// One replay of a recording.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -75,20 +76,25 @@ impl Distribution {
             rows.iter().map(|row| row.ate_rmse_m.map_or(f64::INFINITY, |metres| 100.0 * metres)).collect();
         errors_cm.sort_by(f64::total_cmp);
         let n = errors_cm.len();
-        let worst = &errors_cm[n - n.div_ceil(4)..];
         let frames = rows.iter().map(|row| row.frames).sum::<usize>().max(1) as f64;
         Self {
             recording: recording.into(),
             variant: variant.into(),
             replays: n,
             median_cm: f64::midpoint(errors_cm[(n - 1) / 2], errors_cm[n / 2]),
-            worst_quarter_cm: worst.iter().sum::<f64>() / worst.len() as f64,
+            worst_quarter_cm: mean_of_worst_quarter(&errors_cm),
             worst_cm: errors_cm[n - 1],
             lost_percent: 100.0 * rows.iter().map(|row| row.lost).sum::<usize>() as f64 / frames,
             ms_per_frame: rows.iter().map(|row| row.ms_per_frame * row.frames as f64).sum::<f64>() / frames,
             errors_cm,
         }
     }
+}
+
+/// `errors` are ascending.
+fn mean_of_worst_quarter(errors: &[f64]) -> f64 {
+    let worst = &errors[errors.len() - errors.len().div_ceil(4)..];
+    worst.iter().sum::<f64>() / worst.len() as f64
 }
 
 /// The distribution of each recording and variant, in the order of the rows.
@@ -119,6 +125,8 @@ pub struct LeftOut {
     pub best: String,
     /// Mean error of its worst quarter of replays with those, centimetres.
     pub best_cm: f64,
+    /// Ratio of the two errors that chance gives where all settings are as good as the chosen ones: the median of bootstrap draws.
+    pub ratio_by_chance: f64,
 }
 
 /// Cost of a variant over recordings: geometric mean of the ratios of its worst quarter to the best variant's.
@@ -155,9 +163,27 @@ pub fn leave_one_out(all: &[Distribution]) -> Vec<LeftOut> {
             chosen_cm: own.worst_quarter_cm,
             best: best.variant.clone(),
             best_cm: best.worst_quarter_cm,
+            ratio_by_chance: ratio_by_chance(&own.errors_cm, variants.len()),
         })
     };
     recordings.iter().filter_map(choice).collect()
+}
+
+/// Median over draws of the ratio of the worst quarter of one sample to the least of `variants` samples, all drawn from the same errors.
+fn ratio_by_chance(errors: &[f64], variants: usize) -> f64 {
+    let mut random = fastrand::Rng::with_seed(0);
+    let mut sample = || {
+        let mut drawn: Vec<f64> = errors.iter().map(|_| errors[random.usize(..errors.len())]).collect();
+        drawn.sort_by(f64::total_cmp);
+        mean_of_worst_quarter(&drawn)
+    };
+    let mut draw = || {
+        let of_each: Vec<f64> = (0..variants).map(|_| sample()).collect();
+        ratio(of_each[0], of_each.iter().copied().fold(f64::INFINITY, f64::min))
+    };
+    let mut ratios: Vec<f64> = (0..BOOTSTRAP_DRAWS).map(|_| draw()).collect();
+    ratios.sort_by(f64::total_cmp);
+    ratios[BOOTSTRAP_DRAWS / 2]
 }
 
 /// All rows as CSV with a header.
@@ -215,16 +241,17 @@ pub fn to_markdown(all: &[Distribution]) -> String {
     }
     let left_out = leave_one_out(all);
     if !left_out.is_empty() {
-        text += "\n| recording left out | settings by the others | worst quarter, cm | its own best | worst quarter, cm | ratio |\n|---|---|---|---|---|---|\n";
+        text += "\n| recording left out | settings by the others | worst quarter, cm | its own best | worst quarter, cm | ratio | by chance |\n|---|---|---|---|---|---|---|\n";
         for l in left_out {
             let (chosen, best) = (cm(l.chosen_cm), cm(l.best_cm));
             let _ = writeln!(
                 text,
-                "| {} | {} | {chosen} | {} | {best} | {:.2} |",
+                "| {} | {} | {chosen} | {} | {best} | {:.2} | {:.2} |",
                 l.recording,
                 l.chosen,
                 l.best,
-                ratio(l.chosen_cm, l.best_cm)
+                ratio(l.chosen_cm, l.best_cm),
+                l.ratio_by_chance
             );
         }
     }
@@ -322,6 +349,10 @@ mod tests {
         // Of `a` and `c`, y is the better one by the geometric mean; of `a` and `b`, x.
         assert_eq!(left.iter().map(|l| l.chosen.as_str()).collect::<Vec<_>>(), ["y", "y", "x"]);
         assert_eq!((left[2].chosen_cm, left[2].best_cm), (9.0, 3.0));
+        // One replay of each varies by nothing.
+        assert!(left.iter().all(|l| l.ratio_by_chance == 1.0));
+        let varied = ratio_by_chance(&[1.0, 1.1, 1.3, 1.4, 2.0, 2.4, 3.0, 5.0], 5);
+        assert!((1.1..3.0).contains(&varied) && ratio_by_chance(&[2.0; 8], 5) == 1.0, "{varied}");
         assert!(leave_one_out(&all[..1]).is_empty());
         let all_fail: Vec<ReplayRow> = ["x", "y"].map(|variant| row("d", variant, f64::INFINITY, 99)).into();
         let with_failures = distributions(&[rows, all_fail].concat());

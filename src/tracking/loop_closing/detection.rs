@@ -182,7 +182,8 @@ impl Search<'_> {
         let (now, before) = (here.dense.as_ref()?, there.dense.as_ref()?);
         let guesses = aligned.map(|aligned| aligned.to_rigid()).into_iter().chain([Se3::identity()]);
         let seen_from = |guess: Se3| {
-            let prior = align(before, now, &[guess]).filter(|found| found.overlap >= MIN_OVERLAP)?.prior(&there.camera_from_world);
+            let prior =
+                align(before, now, &[guess]).filter(|found| found.overlap >= MIN_OVERLAP)?.prior(&there.camera_from_world);
             let seen = self.search_in(landmarks, keyframe, &prior.camera_from_world, Some(&prior));
             let found = seen.matches.len();
             let enough = found >= MIN_INLIERS_EACH && found as f64 >= MIN_FOUND_SHARE * seen.expected as f64;
