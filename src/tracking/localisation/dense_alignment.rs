@@ -9,7 +9,7 @@ use crate::geometry::{Pinhole, Se3, se3};
 use crate::tracking::features::dense_frame::DenseFrame;
 use crate::tracking::solvers::pose::PosePrior;
 
-/// Halvings of that, coarsest first, with the iterations on each.
+/// Halvings of a frame's size, coarsest first, with the iterations on each.
 const LEVELS: [(u32, usize); 4] = [(3, 20), (2, 16), (1, 12), (0, 10)];
 /// Standard deviations of inverse depth among neighbouring pixels (1/metres; less than a lone keypoint's, which may lie on an edge), and of
 /// brightness, grey levels.

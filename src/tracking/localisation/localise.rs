@@ -57,8 +57,9 @@ pub struct Localised {
     /// The landmark that each feature shows.
     pub landmarks: Vec<Option<usize>>,
     pub inliers: usize,
-    /// How many were matched, inliers and outliers, and the median of their squared pixel residuals, whitened.
+    /// How many were matched, inliers and outliers.
     pub matches: usize,
+    /// Median of their squared pixel residuals, whitened.
     pub median_squared: f64,
     /// Whether the pose came without a prediction.
     pub rough: bool,

@@ -64,6 +64,9 @@ pub struct Recognised {
     pub landmarks: Vec<usize>,
 }
 
+/// Where a keyframe ought to be, as in [`Recognised::corrected`], and the landmarks of the place with the features that show them.
+type Confirmed = (Sim3, Vec<(usize, usize)>);
+
 /// Whether depth was measured: then lengths cannot drift.
 pub fn knows_scale(map: &Map) -> bool {
     map.keyframes.first().is_some_and(|k| k.features.features.iter().any(|f| f.depth_metres.is_some()))
@@ -121,24 +124,21 @@ impl Search<'_> {
 
     /// Makes sure that `keyframe` shows `place`, or a place that looks just like it.
     pub fn recognise(&self, keyframe: usize, place: usize) -> Option<Recognised> {
+        let aligned = self.align(keyframe, place);
+        let has_pixels = [keyframe, place].iter().all(|k| self.map.keyframes[*k].dense.is_some());
+        if aligned.is_none() && !has_pixels {
+            return None;
+        }
         let mut around = vec![place];
         around.extend(self.connected(place).into_iter().filter(|k| self.is_old(*k, keyframe)).take(PLACE_NEIGHBOURS));
         let landmarks = self.map.landmarks_of(&around);
-        let aligned = self.align(keyframe, place);
         let by_neighbours = aligned.and_then(|aligned| self.confirm_by_neighbours(keyframe, place, &landmarks, &aligned));
         let (corrected, matches) = by_neighbours.or_else(|| self.confirm_by_pixels(keyframe, place, &landmarks, aligned))?;
         Some(Recognised { keyframe, place, corrected, matches, landmarks })
     }
 
-    /// Where a keyframe ought to be, and the landmarks of the place that it shows, if its neighbours show them too. `aligned` is
-    /// keyframe_from_place.
-    fn confirm_by_neighbours(
-        &self,
-        keyframe: usize,
-        place: usize,
-        landmarks: &[usize],
-        aligned: &Sim3,
-    ) -> Option<(Sim3, Vec<(usize, usize)>)> {
+    /// Confirms a place if the keyframe's neighbours show it too. `aligned` is keyframe_from_place.
+    fn confirm_by_neighbours(&self, keyframe: usize, place: usize, landmarks: &[usize], aligned: &Sim3) -> Option<Confirmed> {
         let rough = *aligned * Sim3::from(self.map.keyframes[place].camera_from_world);
         let seen = self.search_in(landmarks, keyframe, &rough.to_rigid(), None);
         if seen.matches.len() < MIN_INLIERS_EACH {
@@ -170,14 +170,8 @@ impl Search<'_> {
         confirmed.then_some((corrected, seen.matches))
     }
 
-    /// The same where landmarks are few, if all pixels agree with them: those of a wall fit elsewhere too, and so do a few landmarks.
-    fn confirm_by_pixels(
-        &self,
-        keyframe: usize,
-        place: usize,
-        landmarks: &[usize],
-        aligned: Option<Sim3>,
-    ) -> Option<(Sim3, Vec<(usize, usize)>)> {
+    /// Confirms a place that shows few landmarks if all pixels agree with these: those of a wall fit elsewhere too, and so do a few landmarks.
+    fn confirm_by_pixels(&self, keyframe: usize, place: usize, landmarks: &[usize], aligned: Option<Sim3>) -> Option<Confirmed> {
         let (here, there) = (&self.map.keyframes[keyframe], &self.map.keyframes[place]);
         let (now, before) = (here.dense.as_ref()?, there.dense.as_ref()?);
         let guesses = aligned.map(|aligned| aligned.to_rigid()).into_iter().chain([Se3::identity()]);
