@@ -311,7 +311,8 @@ fn a_tilt_of_the_measured_depth_is_found() {
     };
     let frames: Vec<Frame> = (0..40).map(tilted).collect();
     let with = |depth_bias| {
-        let config = TrackingConfig { features: Some(500), depth_bias, ..Default::default() };
+        // Where pixels count more, a tilt does less harm.
+        let config = TrackingConfig { features: Some(500), depth_bias, pixel_noise: false, ..Default::default() };
         run(Tracker::new(CAMERA, Sensor::Rgbd, &config).unwrap(), &frames).0
     };
     let (aware, unaware) = (with(true), with(false));
@@ -322,6 +323,17 @@ fn a_tilt_of_the_measured_depth_is_found() {
         |tracker: &Tracker| tracker.trajectory().iter().map(|(i, pose)| error(&pose.world_from_camera, *i).0).fold(0.0, f64::max);
     let (aware, unaware) = (worst(&aware), worst(&unaware));
     assert!(aware < 0.6 * unaware, "{aware} {unaware}");
+}
+
+#[test]
+fn sharp_images_lower_the_noise_of_keypoints() {
+    let frames: Vec<Frame> = (0..25).map(|i| render(i, &truth(i))).collect();
+    let sigma = |pixel_noise| {
+        let config = TrackingConfig { features: Some(500), pixel_noise, ..Default::default() };
+        run(Tracker::new(CAMERA, Sensor::Rgbd, &config).unwrap(), &frames).0.pixel_sigma()
+    };
+    assert_eq!(sigma(false), 1.0);
+    assert!((0.5..0.9).contains(&sigma(true)), "{}", sigma(true));
 }
 
 #[test]
