@@ -139,8 +139,7 @@ impl Mapper {
         schedule::draw_least_learnt(&learnable, taken, count, &mut self.rng).into_iter().map(Step::new).collect()
     }
 
-    /// So many steps of the running epoch.
-    /// `left`: steps left of the refinement.
+    /// So many steps of the running epoch; `left` is how many the refinement has left.
     fn draw_from_epoch(&mut self, count: usize, left: usize, coarse: bool) -> Result<Vec<Step>, MappingError> {
         let mut steps = Vec::with_capacity(count);
         while steps.len() < count {
@@ -226,12 +225,11 @@ impl Mapper {
         let mut adam = refinement.rates(self.progress(refinement));
         let mut taken = Taken::default();
         let is_extra = refinement.progress() >= 1.0;
-        let left = if is_extra { refinement.more } else { steps - refinement.done };
-        let end = refinement.done + density_every.min(left);
+        let left = |refinement: &FinalRefinement| if is_extra { refinement.more } else { steps - refinement.done };
+        let end = refinement.done + density_every.min(left(refinement));
         while refinement.done < end && !refinement.is_done() && refinement.interlude(self, interlude)?.is_continue() {
             let coarse = self.progress(refinement) < half_size_share;
-            let left = if is_extra { refinement.more } else { steps - refinement.done };
-            let mut batch = self.draw_from_epoch(BATCH.min(end - refinement.done), left, coarse)?;
+            let mut batch = self.draw_from_epoch(BATCH.min(end - refinement.done), left(refinement), coarse)?;
             if batch.is_empty() {
                 refinement.end_here();
                 break;

@@ -1,4 +1,4 @@
-//! ORB keypoints and descriptors of a frame, their depths, and matching.
+//! ORB keypoints and descriptors of a frame, their depths, and matching; its pixels for dense alignment.
 
 pub mod dense_frame;
 pub mod descriptor;
