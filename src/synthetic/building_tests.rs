@@ -82,7 +82,7 @@ fn nothing_is_seen_through_a_wall() {
     for frame in (0..config.frames).step_by(5) {
         let pose = recording.path.world_from_camera(recording.time_s(frame));
         let eye = position(&pose);
-        for (i, geometry) in recording.render(frame).geometry.iter().enumerate() {
+        for (i, geometry) in recording.render(frame, 0).geometry.iter().enumerate() {
             let pixel = nalgebra::Vector2::new((i % 32) as f64, (i / 32) as f64);
             let depth_metres = f64::from(geometry.depth_metres);
             assert!((0.3..16.0).contains(&depth_metres), "frame {frame}, {pixel}: {depth_metres} m");
@@ -111,7 +111,7 @@ fn rooms_differ_and_are_lit() {
     let config = building();
     let recording = Recording::new(&config).unwrap();
     let means: Vec<Vec3> =
-        [60, 180, 300, 420].map(|frame| recording.render(frame).color.iter().sum::<Vec3>() / (32.0 * 24.0)).to_vec();
+        [60, 180, 300, 420].map(|frame| recording.render(frame, 0).color.iter().sum::<Vec3>() / (32.0 * 24.0)).to_vec();
     assert!(means.iter().all(|mean| (0.08..0.9).contains(&(mean.element_sum() / 3.0))), "{means:?}");
     let plan = Plan::new(&config).unwrap();
     let (rooms, mut looks) = (&plan.rooms, std::collections::BTreeSet::new());

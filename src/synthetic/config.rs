@@ -16,6 +16,9 @@ pub struct SceneConfig {
     pub fps: f64,
     /// Recording camera.
     pub camera: CameraConfig,
+    /// A second camera; without one, the recording has depth images.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub stereo: Option<StereoConfig>,
     /// Size and gloss of the room.
     pub room: RoomConfig,
     /// Pieces of furniture.
@@ -33,6 +36,7 @@ impl Default for SceneConfig {
             frames: 160,
             fps: 30.0,
             camera: CameraConfig::default(),
+            stereo: None,
             room: RoomConfig::default(),
             furniture: FurnitureConfig::default(),
             path: PathConfig::default(),
@@ -71,6 +75,22 @@ impl Default for CameraConfig {
     fn default() -> Self {
         let (width, height) = (640, 480);
         Self { width, height, fx: 525.0, fy: 525.0, cx: 319.5, cy: 239.5, k1: 0.0, k2: 0.0, p1: 0.0, p2: 0.0 }
+    }
+}
+
+/// The right camera of a rectified stereo pair. Such a recording has no depth images, and its lenses no distortion.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct StereoConfig {
+    /// Distance between the cameras, metres.
+    pub baseline: f64,
+    /// The most that the right camera is turned about each axis, unknown to the calibration, degrees.
+    pub misalignment: f64,
+}
+
+impl Default for StereoConfig {
+    fn default() -> Self {
+        Self { baseline: 0.12, misalignment: 0.0 }
     }
 }
 
@@ -150,6 +170,8 @@ pub enum PathKind {
     Loop,
     /// Once through all rooms, and once round in each.
     Walk,
+    /// Straight along the room's width, looking ahead.
+    Drive,
 }
 
 /// The camera's path.
@@ -161,7 +183,7 @@ pub struct PathConfig {
     /// Times round the room, for a loop; the last frame is back at the start.
     pub rounds: u32,
     /// The most that the path itself, without the hand's shake, moves, m/s. A sweep goes at the pace that this and the turning
-    /// rate allow together; loops and walks take as long as there are frames.
+    /// rate allow together; other paths take as long as there are frames.
     pub speed: f64,
     /// The most that the path itself turns, degrees/s.
     pub turn_rate: f64,
@@ -279,7 +301,19 @@ impl SceneConfig {
         for (field, value) in [("camera.p1", c.p1), ("camera.p2", c.p2)] {
             within(field, value, -0.1, 0.1)?;
         }
-        Ok(())
+        self.stereo.as_ref().map_or(Ok(()), |stereo| self.validate_stereo(stereo))
+    }
+
+    fn validate_stereo(&self, stereo: &StereoConfig) -> Result<(), SceneError> {
+        within("stereo.baseline", stereo.baseline, 0.01, 1.0)?;
+        within("stereo.misalignment", stereo.misalignment, 0.0, 1.0)?;
+        let c = &self.camera;
+        if [c.k1, c.k2, c.p1, c.p2] == [0.0; 4] {
+            Ok(())
+        } else {
+            let what = "must be 0 with `stereo`: the images of a rectified pair have no distortion".into();
+            Err(SceneError::Field { field: "camera.k1, k2, p1, p2", what })
+        }
     }
 
     fn validate_degradation(&self) -> Result<(), SceneError> {

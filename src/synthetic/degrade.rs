@@ -52,8 +52,9 @@ impl Sensor {
         Self { settings: config.degradation.clone(), seed: config.seed, fps: config.fps, width: config.camera.width as usize }
     }
 
-    pub fn record(&self, rendered: &Rendered, frame: usize) -> Recorded {
-        let mut rng = Rng::with_seed(self.seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) ^ frame as u64);
+    /// What a camera (0: the only or the left one) records of a frame.
+    pub fn record(&self, rendered: &Rendered, frame: usize, camera: usize) -> Recorded {
+        let mut rng = Rng::with_seed(self.seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) ^ frame as u64 ^ (camera as u64) << 32);
         let covered = self.settings.covered.is_some_and(|[from, to]| (from..to).contains(&frame));
         let gain = if covered { Vec3::ZERO } else { self.gain(frame as f64 / self.fps) };
         let noise = self.settings.image_noise as f32;

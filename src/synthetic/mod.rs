@@ -1,5 +1,5 @@
-//! Synthetic recordings: a furnished, textured room or a building of them, ray-cast along a hand-held camera's path with exact depth and poses, written
-//! in TUM's layout.
+//! Synthetic recordings: a furnished, textured room or a building of them, ray-cast along a hand-held camera's path with exact poses, written with
+//! depth in TUM's layout or as a stereo pair in KITTI's.
 //!
 //! `config` says what a scene is; `building`, `room` and `furniture` build it, `light` and `surface` bake how it looks, `path` and
 //! `walk` move the camera, `render` casts the rays, `degrade` is the sensor. It leaves out: mirrors and glass, deforming things, rolling
@@ -36,7 +36,7 @@ use sha2::{Digest, Sha256};
 
 use crate::geometry::{Camera, Distortion, Pinhole, Se3, StampedPose, Trajectory};
 
-pub use config::{CameraConfig, DegradationConfig, FurnitureConfig, PathConfig, PathKind, RoomConfig, SceneConfig};
+pub use config::{CameraConfig, DegradationConfig, FurnitureConfig, PathConfig, PathKind, RoomConfig, SceneConfig, StereoConfig};
 pub use exact::visible_surface;
 
 use building::Rooms;
@@ -219,6 +219,8 @@ struct Recording<'a> {
     config: &'a SceneConfig,
     path: CameraPath,
     renderer: Renderer,
+    /// `left_from_camera` of each camera.
+    cameras: Vec<Se3>,
 }
 
 impl<'a> Recording<'a> {
@@ -227,17 +229,17 @@ impl<'a> Recording<'a> {
         let renderer = Renderer::new(&config.camera(), Scene::new(solids, rooms), mover, config.room.gloss);
         let moment = |(time_s, pose): &(f64, Se3)| Moment { world_from_camera: *pose, time_s: *time_s, subpixel: DVec2::ZERO };
         renderer.warm_up(&sampled.iter().step_by(8).map(moment).collect::<Vec<_>>());
-        Ok(Self { config, path, renderer })
+        Ok(Self { config, path, renderer, cameras: cameras(config) })
     }
 
     fn time_s(&self, frame: usize) -> f64 {
         frame as f64 / self.config.fps
     }
 
-    fn render(&self, frame: usize) -> Rendered {
+    fn render(&self, frame: usize, camera: usize) -> Rendered {
         let middle_s = self.time_s(frame);
-        let moment =
-            |time_s: f64, subpixel: DVec2| Moment { world_from_camera: self.path.world_from_camera(time_s), time_s, subpixel };
+        let pose = |time_s: f64| self.path.world_from_camera(time_s) * self.cameras[camera];
+        let moment = |time_s: f64, subpixel: DVec2| Moment { world_from_camera: pose(time_s), time_s, subpixel };
         let exposure_s = self.config.degradation.motion_blur / self.config.fps;
         if exposure_s == 0.0 {
             return self.renderer.render(&moment(middle_s, DVec2::ZERO), true);
@@ -271,16 +273,27 @@ impl<'a> Recording<'a> {
 /// [`SceneError`] if the scene has no place for its furniture, the path comes too close to a surface, `out` exists, or writing fails.
 pub fn generate(config: &SceneConfig, out: &Path, progress: &(dyn Fn(usize, usize) + Sync)) -> Result<(), SceneError> {
     config.validate()?;
-    let writer = write::Writer::new(out)?;
+    let writer = write::Writer::new(config, out)?;
     let recording = Recording::new(config)?;
     let sensor = degrade::Sensor::new(config);
     let done = AtomicUsize::new(0);
     (0..config.frames).into_par_iter().with_max_len(1).try_for_each(|frame| {
-        writer.frame(config, frame, &sensor.record(&recording.render(frame), frame))?;
+        let record = |camera: usize| sensor.record(&recording.render(frame, camera), frame, camera);
+        writer.frame(config, frame, &(0..recording.cameras.len()).map(record).collect::<Vec<_>>())?;
         progress(done.fetch_add(1, Ordering::Relaxed) + 1, config.frames);
         Ok(())
     })?;
     writer.finish(config, &recording.trajectory())
+}
+
+/// `left_from_camera` of each camera. The right one's calibration does not know that it is turned.
+fn cameras(config: &SceneConfig) -> Vec<Se3> {
+    let right = config.stereo.as_ref().map(|stereo| {
+        let mut rng = fastrand::Rng::with_seed(config.seed ^ 0x57E2_E0CA_3E2A);
+        let turned = [(); 3].map(|()| (2.0 * rng.f64() - 1.0) * stereo.misalignment.to_radians());
+        Se3::new(nalgebra::Vector3::new(stereo.baseline, 0.0, 0.0), turned.into())
+    });
+    std::iter::once(Se3::identity()).chain(right).collect()
 }
 
 /// A lens that folds the image over itself cannot be rendered: every recorded pixel needs the one ray that it shows.
@@ -302,8 +315,9 @@ fn check_lens(camera: &Camera) -> Result<(), SceneError> {
 }
 
 fn check_clearance(config: &SceneConfig, path: &CameraPath, solids: &[Primitive], rooms: &Rooms) -> Result<(), SceneError> {
-    for frame in 0..config.frames {
-        let p = room::position(&path.world_from_camera(frame as f64 / config.fps));
+    let cameras = cameras(config);
+    for (frame, camera) in (0..config.frames).flat_map(|frame| cameras.iter().map(move |camera| (frame, camera))) {
+        let p = room::position(&(path.world_from_camera(frame as f64 / config.fps) * camera));
         let distance_metres = rooms.solids_near(p).map(|k| solids[k].distance(p)).fold(f64::INFINITY, f64::min);
         if distance_metres < room::MIN_CLEARANCE {
             return Err(SceneError::TooClose { frame, distance_metres });

@@ -18,6 +18,8 @@ const SAMPLES_PER_TURN: usize = 2048;
 /// A hand shakes in this band, Hz; more slowly it is part of the path, faster it has no amplitude left.
 const SHAKE_BAND_HZ: (f64, f64) = (0.25, 1.8);
 const SHAKE_WAVES: usize = 6;
+/// Beginning and end of a drive, shares of the room's width.
+const DRIVE: (f64, f64) = (0.06, 0.7);
 
 /// Position in the room, and where the camera looks: metres and radians.
 #[derive(Clone, Copy)]
@@ -57,6 +59,7 @@ impl CameraPath {
             PathKind::Sweep => (1, "sweeps"),
             PathKind::Loop => (path.rounds, "rounds"),
             PathKind::Walk => (plan.rooms() as u32, "rooms"),
+            PathKind::Drive => (1, "drives"),
         };
         let room = Vector3::new(config.room.width, config.room.depth, config.room.height);
         let mut rng = Rng::with_seed(config.seed ^ 0x05EE_D0FA_11AD);
@@ -114,6 +117,7 @@ impl CameraPath {
         match (&self.walk, self.kind) {
             (Some(walk), _) => walk.station(phi / (TAU * self.rounds)),
             (None, PathKind::Sweep) => self.sweep(phi),
+            (None, PathKind::Drive) => self.drive(phi),
             (None, _) => self.round(phi),
         }
     }
@@ -128,6 +132,19 @@ impl CameraPath {
             position: middle + across + along,
             yaw_rad: (225.0 + 38.0 * (phi + 0.2).cos()).to_radians(),
             pitch_rad: (-17.0 + 5.0 * (2.0 * phi + 1.0).sin()).to_radians(),
+        }
+    }
+
+    /// Along the middle of the room with gentle bends, as a car keeps to its lane.
+    fn drive(&self, phi: f64) -> Station {
+        let along = Vector3::x() * (self.room.x * (DRIVE.1 - DRIVE.0) / TAU);
+        let bend = 0.04 * self.room.y;
+        let across = Vector3::y() * (bend * phi.sin() + 0.5 * bend * (2.3 * phi).sin());
+        let slope = bend * phi.cos() + 1.15 * bend * (2.3 * phi).cos();
+        Station {
+            position: Vector3::new(DRIVE.0 * self.room.x, 0.5 * self.room.y, self.height) + along * phi + across,
+            yaw_rad: slope.atan2(along.x),
+            pitch_rad: -0.03,
         }
     }
 
@@ -201,6 +218,23 @@ mod tests {
             turned = turned.max(a.rotation.angle_to(&b.rotation).to_degrees());
         }
         assert!((0.007..0.017).contains(&moved) && (0.7..2.4).contains(&turned), "{moved} m, {turned}°");
+    }
+
+    #[test]
+    fn a_drive_goes_along_the_room_and_looks_where_it_goes() {
+        let (path, config) = path(|c| {
+            (c.path.kind, c.frames, c.room.width, c.path.speed) = (PathKind::Drive, 100, 30.0, 8.0);
+            (c.path.shake_metres, c.path.shake_degrees) = (0.0, 0.0);
+        });
+        let at = |frame: f64| path.world_from_camera(frame / config.fps);
+        let travelled = at(99.0).translation.x - at(0.0).translation.x;
+        assert!((travelled - (DRIVE.1 - DRIVE.0) * 30.0).abs() < 1e-6, "{travelled}");
+        // Before the first frame and after the last one it goes on, for the exposure's sake.
+        for frame in -1..100 {
+            let (a, b) = (at(f64::from(frame)), at(f64::from(frame) + 0.5));
+            let (moved, ahead) = (b.translation.vector - a.translation.vector, a.rotation * Vector3::z());
+            assert!((0.05..0.2).contains(&moved.norm()) && moved.xy().normalize().dot(&ahead.xy().normalize()) > 0.999, "{frame}");
+        }
     }
 
     #[test]

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use nalgebra::{Point3, Vector2};
 
 use super::*;
-use crate::sequence::{Frame, Sequence};
+use crate::sequence::{Frame, Sensor, Sequence};
 
 /// A small room seen by a small camera.
 fn small() -> SceneConfig {
@@ -221,6 +221,49 @@ fn every_view_has_texture_and_light() {
     }
 }
 
+/// What the left camera sees at a depth, the right one sees where its baseline puts it; what is written is read as a stereo recording.
+#[test]
+fn a_stereo_pair_agrees_with_depth_and_calibration() {
+    let config = with(|c| c.stereo = Some(StereoConfig { baseline: 0.2, misalignment: 0.0 }));
+    let (_folder, sequence) = record(&config);
+    let Sensor::Stereo { baseline_metres } = sequence.sensor else { panic!("{:?}", sequence.sensor) };
+    assert!((baseline_metres - 0.2).abs() < 1e-12);
+    let recording = Recording::new(&config).unwrap();
+    let truth = sequence.groundtruth.clone().unwrap();
+    assert!(truth.poses.iter().zip(&recording.trajectory().poses).all(|(a, b)| {
+        (a.world_from_camera.translation.vector - b.world_from_camera.translation.vector).norm() < 1e-9
+            && a.world_from_camera.rotation.angle_to(&b.world_from_camera.rotation) < 1e-7
+    }));
+    let (mut compared, mut agreed) = (0, 0);
+    for k in 0..config.frames {
+        let frame = sequence.load(k).unwrap();
+        let (left, right) = (frame.color.to_luma8(), frame.right.unwrap().to_luma8());
+        let geometry = recording.render(k, 0).geometry;
+        for (x, y) in (0..72u32).flat_map(|y| (0..96u32).map(move |x| (x, y))) {
+            let shifted = f64::from(x) - 80.0 * 0.2 / f64::from(geometry[(y * 96 + x) as usize].depth_metres);
+            if shifted < 0.0 {
+                continue;
+            }
+            let (whole, part) = (shifted.floor() as u32, shifted.fract());
+            let grey = |x: u32| f64::from(right.get_pixel(x.min(95), y)[0]);
+            let seen = grey(whole) + part * (grey(whole + 1) - grey(whole));
+            compared += 1;
+            agreed += usize::from((seen - f64::from(left.get_pixel(x, y)[0])).abs() < 12.0);
+        }
+    }
+    assert!(compared > 20_000 && agreed * 100 > compared * 85, "{agreed} of {compared}");
+}
+
+#[test]
+fn a_misaligned_pair_is_turned_by_no_more_than_that_and_by_its_seed() {
+    let turned = |seed: u64| {
+        let config = with(|c| (c.seed, c.stereo) = (seed, Some(StereoConfig { baseline: 0.2, misalignment: 0.02 })));
+        cameras(&config)[1].rotation.scaled_axis() * 1f64.to_degrees()
+    };
+    assert!((1..20).all(|seed| turned(seed).amax() <= 0.02 && turned(seed).norm() > 0.0));
+    assert!(turned(1) != turned(2) && turned(1) == turned(1));
+}
+
 #[test]
 fn bad_scenes_are_refused_with_the_field_and_what_to_do() {
     assert!(error(|c| c.frames = 0).contains("`frames` is 0"));
@@ -232,6 +275,8 @@ fn bad_scenes_are_refused_with_the_field_and_what_to_do() {
     assert!(error(|c| c.degradation.covered = Some([3, 3])).contains("from < to"));
     assert!(error(|c| c.degradation.covered = Some([3, 300])).contains("<= 6 frames"));
     assert!(error(|c| (c.path.kind, c.path.rounds) = (PathKind::Loop, 2)).contains("give at least"));
+    assert!(error(|c| c.stereo = Some(StereoConfig { baseline: -0.1, misalignment: 0.0 })).contains("`stereo.baseline` is -0.1"));
+    assert!(error(|c| (c.stereo, c.camera.k1) = (Some(StereoConfig::default()), 0.1)).contains("must be 0 with `stereo`"));
     assert!(error(|c| (c.room.height, c.path.height) = (2.2, 1.9)).contains("`path.height`"));
 }
 
@@ -269,7 +314,11 @@ fn shipped_scenes_can_be_built() {
             turn = turn.max(a.rotation.angle_to(&b.rotation).to_degrees() * per_s);
         }
         println!("{}: at most {speed:.2} m/s, {turn:.0} degrees/s", scene.display());
-        let (most, fastest) = if config.path.kind == PathKind::Loop { (0.8, 60.0) } else { (0.5, 40.0) };
+        let (most, fastest) = match config.path.kind {
+            PathKind::Loop => (0.8, 60.0),
+            PathKind::Drive => (4.5, 20.0),
+            PathKind::Sweep | PathKind::Walk => (0.5, 40.0),
+        };
         assert!(speed < most && turn < fastest, "{}: {speed} m/s, {turn} degrees/s", scene.display());
     }
 }
@@ -294,7 +343,7 @@ fn the_exact_surface_is_what_the_camera_measures() {
     };
     let off: Vec<glam::Vec3> = surface.vertices.iter().step_by(97).copied().filter(|p| !near(p.as_dvec3())).collect();
     assert!(off.is_empty(), "on no surface: {off:?}");
-    let (depth, pose) = (recording.render(6).geometry, recording.path.world_from_camera(recording.time_s(6)));
+    let (depth, pose) = (recording.render(6, 0).geometry, recording.path.world_from_camera(recording.time_s(6)));
     let pinhole = config.camera().pinhole;
     let pixels = (0..64 * 48).step_by(61).map(|i| (i, nalgebra::Vector2::new(f64::from(i % 64), f64::from(i / 64))));
     for (i, pixel) in pixels {

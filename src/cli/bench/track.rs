@@ -22,8 +22,6 @@ use crate::cli::{Verbosity, generate, jobs, print, progress};
 
 /// Frames extracted ahead.
 const AHEAD: usize = 8;
-/// The room that other seeds furnish anew.
-const ROOM: &str = "room-noisy";
 const FIRST_ROOM_SEED: u64 = 101;
 const ROOM_FRAMES: usize = 150;
 
@@ -37,9 +35,12 @@ pub(super) struct TrackArgs {
     /// Write a plan of tasks into this folder instead, for `keysplat jobs`.
     #[arg(long, value_name = "FOLDER", conflicts_with = "out")]
     plan: Option<PathBuf>,
-    /// Synthetic rooms of differing furnishing, textures and shake, 150 frames each, beside the recordings; one distribution in all.
+    /// Synthetic rooms of differing furnishing, textures and shake, up to 150 frames each, beside the recordings; one distribution a scene.
     #[arg(long, default_value_t = 0)]
     rooms: u64,
+    /// Scenes that `--rooms` furnishes anew, e.g. room-noisy, room-stereo, hall-drive.
+    #[arg(long, value_name = "SCENE", value_delimiter = ',', default_value = "room-noisy")]
+    scenes: Vec<String>,
     /// Start frames, spread over the first half of a recording; each replay goes on to the end.
     #[arg(long, default_value_t = 10, value_parser = at_least_one)]
     starts: usize,
@@ -153,11 +154,14 @@ fn sources(args: &TrackArgs, out: &Path, verbosity: Verbosity) -> miette::Result
     for sequence in &args.sequences {
         folders.push(recording(sequence, out, verbosity)?);
     }
-    for seed in (FIRST_ROOM_SEED..).take(args.rooms as usize) {
-        let scene = scene(ROOM)?;
-        let folder = out.join("recordings").join(format!("{ROOM}-{seed}"));
-        generate::render_if_changed(&SceneConfig { seed, frames: ROOM_FRAMES, ..scene }, &folder, verbosity)?;
-        folders.push(("rooms".into(), folder));
+    for name in &args.scenes {
+        let scene = scene(name)?;
+        let frames = scene.frames.min(ROOM_FRAMES);
+        for seed in (FIRST_ROOM_SEED..).take(args.rooms as usize) {
+            let folder = out.join("recordings").join(format!("{name}-{seed}"));
+            generate::render_if_changed(&SceneConfig { seed, frames, ..scene.clone() }, &folder, verbosity)?;
+            folders.push((name.clone(), folder));
+        }
     }
     if folders.is_empty() {
         return Err(miette!("nothing to replay: give recordings, or --rooms"));
