@@ -1,5 +1,8 @@
 //! Measures what viewers cost the mapper: the same run without a view, with one, and with viewers of several kinds, in turn.
 //!
+//! Seconds of a clock depend on what else the machine does. Processor time hardly does: of the whole process, which on a software adapter includes all
+//! rendering, without the viewers' own threads.
+//!
 //! usage: cargo run --release --example view_cost -- RECORDING [ROUNDS] [FRAMES] [MAP_SCALE]
 
 use std::error::Error;
@@ -8,6 +11,7 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
+use cpu_time::{ProcessTime, ThreadTime};
 use keysplat::viewing::{Live, Server, ServerOptions};
 use keysplat::{Config, Progress, Session};
 use serde_json::{Value, json};
@@ -54,34 +58,47 @@ fn main() -> Outcome<()> {
     let mut config = Config::for_recording(Path::new(recording));
     config.map_scale = number(3, 0.5)?;
     config.replay.frames = Some((0, frames));
-    let mut rates: Vec<Vec<f64>> = vec![Vec::new(); MODES.len()];
+    let mut rounds_of: Vec<Vec<Speed>> = vec![Vec::new(); MODES.len()];
     let mut hashes = Vec::new();
     for round in 0..rounds {
-        for (mode, rates) in MODES.iter().zip(&mut rates) {
-            let (rate, hash) = measure(&config, mode.1, mode.2)?;
-            eprintln!("round {round}, {}: {rate:.2} steps/s", mode.0);
-            rates.push(rate);
+        for (mode, speeds) in MODES.iter().zip(&mut rounds_of) {
+            let (speed, hash) = measure(&config, mode.1, mode.2)?;
+            eprintln!("round {round}, {}: {:.2} steps/s, {:.2} steps a processor second", mode.0, speed.by_clock, speed.by_processor);
+            speeds.push(speed);
             hashes.push(hash);
         }
     }
     hashes.dedup();
-    println!("| viewers | steps a second, median | ratio to the run without, round by round: median | least | most |");
+    println!("Ratios are to the run without a view, round by round: median (least–most).\n");
+    println!("| viewers | steps a second, median | ratio | steps a processor second, median | ratio |");
     println!("|---|---|---|---|---|");
-    for (k, mode) in MODES.iter().enumerate() {
-        let mut ratios: Vec<f64> = rates[k].iter().zip(&rates[0]).map(|(rate, without)| rate / without).collect();
-        let median = |values: &mut Vec<f64>| {
-            values.sort_by(f64::total_cmp);
-            values[values.len() / 2]
-        };
-        let (rate, ratio) = (median(&mut rates[k].clone()), median(&mut ratios));
-        println!("| {} | {rate:.2} | {ratio:.3} | {:.3} | {:.3} |", mode.0, ratios[0], ratios[ratios.len() - 1]);
+    for (mode, speeds) in MODES.iter().zip(&rounds_of) {
+        let [by_clock, by_processor] = [|s: &Speed| s.by_clock, |s: &Speed| s.by_processor].map(|of| {
+            let median = sorted(speeds.iter().map(of))[speeds.len() / 2];
+            let ratios = sorted(speeds.iter().zip(&rounds_of[0]).map(|(speed, without)| of(speed) / of(without)));
+            format!("{median:.2} | {:.3} ({:.3}–{:.3})", ratios[ratios.len() / 2], ratios[0], ratios[ratios.len() - 1])
+        });
+        println!("| {} | {by_clock} | {by_processor} |", mode.0);
     }
     println!("\nmaps of all runs: {}", if hashes.len() == 1 { "the same bytes" } else { "DIFFERENT" });
     Ok(())
 }
 
-/// Optimisation steps in a second of the mapper's own time, and the digest of the map.
-fn measure(config: &Config, served: bool, kinds: &[Kind]) -> Outcome<(f64, Vec<u8>)> {
+/// Optimisation steps in a second of the mapper's own time, and in one of all processors.
+#[derive(Clone, Copy)]
+struct Speed {
+    by_clock: f64,
+    by_processor: f64,
+}
+
+fn sorted(values: impl Iterator<Item = f64>) -> Vec<f64> {
+    let mut values: Vec<f64> = values.collect();
+    values.sort_by(f64::total_cmp);
+    values
+}
+
+/// A run's speed, and the digest of its map.
+fn measure(config: &Config, served: bool, kinds: &[Kind]) -> Outcome<(Speed, Vec<u8>)> {
     let folder = tempfile::tempdir()?;
     let mut session = Session::open(config.clone(), folder.path())?;
     let (progress, over) = (Progress::default(), AtomicBool::new(false));
@@ -90,23 +107,27 @@ fn measure(config: &Config, served: bool, kinds: &[Kind]) -> Outcome<(f64, Vec<u
     let start = |live: &Live| Server::start(ServerOptions { address, ..ServerOptions::default() }, live.board(), live.desk());
     let server = live.as_ref().map(start).transpose()?;
     let url = server.as_ref().map(|server| server.url().replace("http:", "ws:").replace("/?", "/live?")).unwrap_or_default();
-    let replay = std::thread::scope(|scope| {
-        for kind in kinds {
-            scope.spawn(|| {
-                if let Err(error) = view(&url, *kind, &over) {
-                    eprintln!("a viewer ended: {error}");
-                }
-            });
+    let clock = ProcessTime::now();
+    let watch = |kind: Kind| {
+        let clock = ThreadTime::now();
+        if let Err(error) = view(&url, kind, &over) {
+            eprintln!("a viewer ended: {error}");
         }
+        clock.elapsed()
+    };
+    let (replay, viewers) = std::thread::scope(|scope| {
+        let viewers: Vec<_> = kinds.iter().map(|kind| scope.spawn(|| watch(*kind))).collect();
         let replay = session.run(&progress);
         over.store(true, Ordering::Relaxed);
-        replay
-    })?;
+        (replay, viewers.into_iter().filter_map(|viewer| viewer.join().ok()).sum::<Duration>())
+    });
+    let (replay, processor) = (replay?, clock.elapsed() - viewers);
     let records = &replay.result.history.keyframes;
     let steps: usize = records.iter().map(|record| record.report.iterations).sum();
     let busy: f64 = records.iter().map(|record| record.busy_s).sum();
     let digest = Sha256::digest(config.map_format.encode(&replay.result.cloud)?);
-    Ok((steps as f64 / busy, digest.to_vec()))
+    let speed = Speed { by_clock: steps as f64 / busy, by_processor: steps as f64 / processor.as_secs_f64() };
+    Ok((speed, digest.to_vec()))
 }
 
 /// One viewer, until the run is over.

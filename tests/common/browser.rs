@@ -152,6 +152,22 @@ impl Page {
         }
     }
 
+    /// Lays fingers on the window and moves them in a straight line each: `(from, to)`, pixels.
+    pub fn swipe(&mut self, fingers: &[([f64; 2], [f64; 2])]) {
+        const MOVES: u32 = 10;
+        for step in 0..=MOVES {
+            let share = f64::from(step) / f64::from(MOVES);
+            let at = |(id, (from, to)): (usize, &([f64; 2], [f64; 2]))| {
+                let [x, y] = [0, 1].map(|k| from[k] + share * (to[k] - from[k]));
+                json!({ "x": x, "y": y, "id": id })
+            };
+            let points: Vec<Value> = fingers.iter().enumerate().map(at).collect();
+            let kind = if step == 0 { "touchStart" } else { "touchMove" };
+            self.call("Input.dispatchTouchEvent", json!({ "type": kind, "touchPoints": points }));
+        }
+        self.call("Input.dispatchTouchEvent", json!({ "type": "touchEnd", "touchPoints": [] }));
+    }
+
     /// Writes a picture of the window.
     pub fn screenshot(&mut self, path: &Path) {
         use base64::Engine;

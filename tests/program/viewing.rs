@@ -12,6 +12,7 @@ use keysplat::render::{GpuCloud, Rasterizer, Rendered};
 use keysplat::splat::{GaussianCloud, ViewCamera};
 use keysplat::viewing::PackedMap;
 use keysplat::{Config, Recording};
+use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 use serde_json::json;
 use tungstenite::stream::MaybeTlsStream;
 use tungstenite::{Message, WebSocket};
@@ -215,7 +216,42 @@ fn compare(page: &mut Page, camera: &ViewCamera, ours: &Rendered) {
     assert!(psnr(&drawn, &ours) > 30.0, "{} dB", psnr(&drawn, &ours));
 }
 
-/// The page draws what our rasterizer draws, from a server and, of an antialiased map, from a report's file; by keyboard, on a phone and on a desk.
+/// Position, rotation and distance to what the camera turns about.
+fn stance(page: &mut Page) -> (Vector3<f64>, UnitQuaternion<f64>, f64) {
+    let state = page.evaluate("window.keysplat.state()");
+    let numbers = |key: &str| -> Vec<f64> { serde_json::from_value(state["pose"][key].clone()).unwrap() };
+    let (p, q) = (numbers("p"), numbers("q"));
+    let rotation = UnitQuaternion::from_quaternion(Quaternion::new(q[3], q[0], q[1], q[2]));
+    (Vector3::from_column_slice(&p), rotation, state["distance"].as_f64().unwrap())
+}
+
+/// One finger orbits, two fingers move sideways, a pinch goes nearer.
+fn touch(page: &mut Page) {
+    page.evaluate("window.keysplat.settled()");
+    let middle = page.evaluate(
+        "(canvas => { canvas.scrollIntoView({ behavior: 'instant' }); const box = canvas.getBoundingClientRect();
+            return [box.left + box.width / 2, box.top + box.height / 2]; })(document.querySelector('#viewer canvas'))",
+    );
+    let middle: [f64; 2] = serde_json::from_value(middle).unwrap();
+    let at = |x: f64, y: f64| [middle[0] + x, middle[1] + y];
+    let (p, q, distance) = stance(page);
+    let pivot = p + q * Vector3::z() * distance;
+    page.swipe(&[(at(-40.0, 0.0), at(30.0, 0.0))]);
+    let before = q;
+    let (p, q, after) = stance(page);
+    assert!(q.angle_to(&before) > 0.1 && (after - distance).abs() < 1e-6 * distance);
+    assert!((p + q * Vector3::z() * distance - pivot).norm() < 1e-3 * distance, "an orbit keeps what it turns about");
+    page.swipe(&[(at(-30.0, 0.0), at(-70.0, 0.0)), (at(30.0, 0.0), at(70.0, 0.0))]);
+    let (nearer, turned, after) = stance(page);
+    assert!((after / distance - 60.0 / 140.0).abs() < 0.02, "{after} of {distance} m");
+    assert!(q.angle_to(&turned) < 1e-6 && (nearer - p).dot(&(q * Vector3::z())) > 0.5 * distance);
+    page.swipe(&[(at(-40.0, 0.0), at(0.0, 40.0)), (at(30.0, 0.0), at(70.0, 40.0))]);
+    let (aside, turned, _) = stance(page);
+    let moved = q.inverse() * (aside - nearer);
+    assert!(q.angle_to(&turned) < 1e-6 && moved.x < 0.0 && moved.y < 0.0 && moved.z.abs() < 0.1 * moved.norm(), "{moved}");
+}
+
+/// The page draws what our rasterizer draws, from a server and, of an antialiased map, from a report's file; by keyboard and touch, on a phone and on a desk.
 #[test]
 fn a_browser_draws_the_map_as_we_do() {
     if skipped_without_adapter() {
@@ -258,6 +294,7 @@ fn a_browser_draws_the_map_as_we_do() {
             compare(&mut page, &camera, &ours);
         }
         page.screenshot(&scratch().join(format!("page-{width}.png")));
+        touch(&mut page);
         let steps = |page: &mut Page| page.press("]", "BracketRight", 221);
         page.evaluate("document.querySelector('#viewer canvas').focus()");
         steps(&mut page);

@@ -17,10 +17,12 @@ use super::ablation::{Variant, parse_variant};
 use crate::cli::{Verbosity, generate, jobs, print, progress};
 
 /// Scenes that need no recording.
-const SCENES: [(&str, &str); 3] = [
+const SCENES: [(&str, &str); 5] = [
     ("demo", include_str!("../../../sequences/demo.toml")),
     ("room-clean", include_str!("../../../sequences/room-clean.toml")),
     ("room-noisy", include_str!("../../../sequences/room-noisy.toml")),
+    ("room-stereo", include_str!("../../../sequences/room-stereo.toml")),
+    ("hall-drive", include_str!("../../../sequences/hall-drive.toml")),
 ];
 /// Origin of a run, in its folder: an identical run is not repeated.
 const MADE_BY: &str = "made-by.json";
@@ -29,7 +31,7 @@ const USUAL_EPOCHS: [usize; 4] = [4, 8, 17, 34];
 
 #[derive(Args)]
 pub(super) struct SweepArgs {
-    /// Recordings, or names of synthetic scenes: demo, room-clean, room-noisy.
+    /// Recordings, or names of synthetic scenes: demo, room-clean, room-noisy, room-stereo, hall-drive.
     #[arg(required = true)]
     sequences: Vec<String>,
     /// Folder for all runs, sweep.csv, sweep.json, sweep.md and curves.svg; a sweep that was interrupted goes on there.

@@ -27,7 +27,7 @@ const ROOM_FRAMES: usize = 150;
 
 #[derive(Args)]
 pub(super) struct TrackArgs {
-    /// Recordings with ground truth, or names of synthetic scenes: demo, room-clean, room-noisy.
+    /// Recordings with ground truth, or names of synthetic scenes: demo, room-clean, room-noisy, room-stereo, hall-drive.
     sequences: Vec<String>,
     /// Folder for track.csv, track.md and track.svg.
     #[arg(short, long, required_unless_present = "plan")]

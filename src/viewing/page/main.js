@@ -275,6 +275,8 @@ class Viewer extends Actions {
         connected: this.connected,
         frameMs: this.stage?.frameMs ?? null,
         digest: this.store?.digest ?? 0,
+        pose: this.controls.pose,
+        distance: this.controls.distance,
       }),
     };
   }
