@@ -63,7 +63,10 @@ fn main() -> Outcome<()> {
     for round in 0..rounds {
         for (mode, speeds) in MODES.iter().zip(&mut rounds_of) {
             let (speed, hash) = measure(&config, mode.1, mode.2)?;
-            eprintln!("round {round}, {}: {:.2} steps/s, {:.2} steps a processor second", mode.0, speed.by_clock, speed.by_processor);
+            eprintln!(
+                "round {round}, {}: {:.2} steps/s, {:.2} steps a processor second",
+                mode.0, speed.by_clock, speed.by_processor
+            );
             speeds.push(speed);
             hashes.push(hash);
         }

@@ -233,7 +233,10 @@ mod tests {
         for frame in -1..100 {
             let (a, b) = (at(f64::from(frame)), at(f64::from(frame) + 0.5));
             let (moved, ahead) = (b.translation.vector - a.translation.vector, a.rotation * Vector3::z());
-            assert!((0.05..0.2).contains(&moved.norm()) && moved.xy().normalize().dot(&ahead.xy().normalize()) > 0.999, "{frame}");
+            assert!(
+                (0.05..0.2).contains(&moved.norm()) && moved.xy().normalize().dot(&ahead.xy().normalize()) > 0.999,
+                "{frame}"
+            );
         }
     }
 

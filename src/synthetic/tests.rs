@@ -237,7 +237,7 @@ fn a_stereo_pair_agrees_with_depth_and_calibration() {
     let (mut compared, mut agreed) = (0, 0);
     for k in 0..config.frames {
         let frame = sequence.load(k).unwrap();
-        let (left, right) = (frame.color.to_luma8(), frame.right.unwrap().to_luma8());
+        let (left, right) = (image::imageops::grayscale(&frame.color), frame.right.unwrap());
         let geometry = recording.render(k, 0).geometry;
         for (x, y) in (0..72u32).flat_map(|y| (0..96u32).map(move |x| (x, y))) {
             let shifted = f64::from(x) - 80.0 * 0.2 / f64::from(geometry[(y * 96 + x) as usize].depth_metres);

@@ -112,8 +112,7 @@ fn tum_files(config: &SceneConfig, poses: &Trajectory) -> Vec<(&'static str, Str
 
 fn kitti_files(config: &SceneConfig, stereo: &StereoConfig, poses: &Trajectory) -> Vec<(&'static str, String)> {
     let c = &config.camera;
-    let projection =
-        |shift: f64| format!("{} 0 {} {} 0 {} {} 0 0 0 1 0", c.fx, c.cx, -c.fx * shift, c.fy, c.cy);
+    let projection = |shift: f64| format!("{} 0 {} {} 0 {} {} 0 0 0 1 0", c.fx, c.cx, -c.fx * shift, c.fy, c.cy);
     let row = |pose: &StampedPose| {
         let matrix = pose.world_from_camera.to_homogeneous();
         let numbers = (0..3).flat_map(|row| (0..4).map(move |column| matrix[(row, column)].to_string()));
