@@ -19,7 +19,7 @@ const SNAPSHOT_EVERY: Duration = Duration::from_millis(250);
 const KEPT_SHARE: u32 = 20;
 const KEPT_EVERY: Duration = Duration::from_secs(1);
 /// Ordered views take at most one part in so many of its time.
-const RENDER_SHARE: u32 = 10;
+const RENDER_SHARE: u32 = 25;
 /// Intersections of an ordered view, at most: a picture from close by is refused before it fills the GPU's memory.
 const MOST_INTERSECTIONS: usize = 1 << 22;
 
