@@ -8,7 +8,7 @@ use image::{ExtendedColorType, ImageEncoder};
 use super::SceneError;
 use super::config::{SceneConfig, StereoConfig};
 use super::degrade::{DEPTH_UNITS_PER_METRE, Recorded};
-use crate::geometry::{StampedPose, Trajectory};
+use crate::geometry::Trajectory;
 
 /// A recording under construction. Dropped before [`Self::finish`], it leaves nothing.
 pub struct Writer {
@@ -113,14 +113,9 @@ fn tum_files(config: &SceneConfig, poses: &Trajectory) -> Vec<(&'static str, Str
 fn kitti_files(config: &SceneConfig, stereo: &StereoConfig, poses: &Trajectory) -> Vec<(&'static str, String)> {
     let c = &config.camera;
     let projection = |shift: f64| format!("{} 0 {} {} 0 {} {} 0 0 0 1 0", c.fx, c.cx, -c.fx * shift, c.fy, c.cy);
-    let row = |pose: &StampedPose| {
-        let matrix = pose.world_from_camera.to_homogeneous();
-        let numbers = (0..3).flat_map(|row| (0..4).map(move |column| matrix[(row, column)].to_string()));
-        numbers.collect::<Vec<_>>().join(" ") + "\n"
-    };
     vec![
         ("calib.txt", format!("P2: {}\nP3: {}\n", projection(0.0), projection(stereo.baseline))),
         ("times.txt", poses.poses.iter().map(|pose| format!("{:.6}\n", pose.timestamp_s)).collect()),
-        ("poses.txt", poses.poses.iter().map(row).collect()),
+        ("poses.txt", poses.to_kitti()),
     ]
 }
