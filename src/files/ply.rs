@@ -1,13 +1,15 @@
-//! Elements of PLY files (Turk 1994): vertices with positions and colours, ASCII or binary little-endian, and where the faces lie.
+//! PLY files (Turk 1994): their header, and vertices with positions and colours, ASCII or binary little-endian.
 //!
-//! Left out: big-endian files, and what follows the faces.
+//! Left out: big-endian files.
+
+use std::io::{BufRead, Read};
 
 use glam::Vec3;
 
 /// Farther from the origin, squares of lengths overflow, metres.
 const MOST_COORDINATE: f32 = 1e7;
-/// No honest header is longer.
-const MOST_HEADER: usize = 1 << 16;
+/// No honest header is longer, bytes. A file without line ends is not read whole in search of one.
+const MOST_HEADER: u64 = 1 << 16;
 /// The colour of vertices that have none.
 const GREY: [u8; 3] = [180; 3];
 
@@ -76,83 +78,141 @@ pub(crate) struct Property {
     pub kind: Scalar,
     /// Type of its length, for a list.
     pub length: Option<Scalar>,
+    /// Bytes from the start of its element, if no list precedes it.
     offset: usize,
     /// Place among the element's properties.
     index: usize,
 }
 
+impl Property {
+    /// Its value in the bytes of an element without lists.
+    pub fn read(&self, element: &[u8]) -> f64 {
+        self.kind.read(&element[self.offset..])
+    }
+}
+
 /// Elements of one kind.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug)]
 pub(crate) struct Element {
+    pub name: String,
     pub count: usize,
     pub properties: Vec<Property>,
-    /// Without lists.
-    stride: usize,
+    /// Line of the header that declares it, from 1.
+    pub line: usize,
+}
+
+impl Element {
+    /// Bytes of one; lists, whose length is in the data, are errors.
+    pub fn stride(&self) -> Result<usize, String> {
+        match self.properties.iter().find(|property| property.length.is_some()) {
+            Some(list) => Err(format!("the property `{}` of a {} is a list", list.name, self.name)),
+            None => Ok(self.properties.last().map_or(0, |last| last.offset + last.kind.bytes())),
+        }
+    }
+
+    /// Adds a property by the words after `property`.
+    fn add(&mut self, words: &[&str]) -> Result<(), String> {
+        let (length, kind, name) = match *words {
+            ["list", length, kind, name] => (Some(Scalar::parse(length)?), kind, name),
+            [kind, name] => (None, kind, name),
+            _ => return Err(format!("`property {}` is not understood", words.join(" "))),
+        };
+        if self.properties.iter().any(|known| known.name == name) {
+            return Err(format!("the property `{name}` is there twice"));
+        }
+        let offset = self.properties.last().map_or(0, |last| last.offset + last.kind.bytes());
+        let property = Property { name: name.into(), kind: Scalar::parse(kind)?, length, offset, index: self.properties.len() };
+        self.properties.push(property);
+        Ok(())
+    }
+}
+
+/// How the numbers are written.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Encoding {
+    Ascii,
+    BinaryLittleEndian,
+}
+
+impl Encoding {
+    /// From the words after `format`.
+    fn parse(words: &[&str]) -> Option<Self> {
+        match words {
+            ["ascii", "1.0"] => Some(Self::Ascii),
+            ["binary_little_endian", "1.0"] => Some(Self::BinaryLittleEndian),
+            _ => None,
+        }
+    }
+}
+
+/// Why a header is of no use.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum HeaderError {
+    #[error(transparent)]
+    Read(#[from] std::io::Error),
+    /// Lines count from 1.
+    #[error("line {line}: {what}")]
+    Text { line: usize, what: String },
 }
 
 /// What a file begins with.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(crate) struct Header {
-    vertex: Option<Element>,
-    pub face: Option<Element>,
-    /// Whether another element follows the faces.
-    is_past_faces: bool,
-    pub is_ascii: bool,
-    bytes: usize,
+    /// In the order of their data.
+    pub elements: Vec<Element>,
+    /// Lines that begin with `comment`, whole.
+    pub comments: Vec<String>,
+    encoding: Option<Encoding>,
+    /// Bytes before the first element's data.
+    pub bytes: usize,
+    /// Lines, `end_header` among them.
+    pub lines: usize,
 }
 
 impl Header {
-    /// Errors say what is wrong with it.
-    pub fn parse(bytes: &[u8]) -> Result<Self, String> {
-        let mut header = Self::default();
-        let mut has_format = false;
-        for (number, line) in bytes[..bytes.len().min(MOST_HEADER)].split_inclusive(|b| *b == b'\n').enumerate() {
-            header.bytes += line.len();
-            let text = String::from_utf8_lossy(line);
+    /// Reads up to the line `end_header`. Encodings that are not accepted are errors.
+    pub fn read(reader: &mut dyn BufRead, accepted: &[Encoding]) -> Result<Self, HeaderError> {
+        let mut header = Self { elements: Vec::new(), comments: Vec::new(), encoding: None, bytes: 0, lines: 0 };
+        let mut reader = reader.take(MOST_HEADER);
+        loop {
+            let mut line = Vec::new();
+            header.bytes += reader.read_until(b'\n', &mut line)?;
+            header.lines += 1;
+            let text = String::from_utf8_lossy(&line);
             let words: Vec<&str> = text.split_whitespace().collect();
-            match words[..] {
-                ["ply"] if number == 0 => {}
-                _ if number == 0 => return Err("it does not begin as a PLY file".into()),
-                ["format", "binary_little_endian", "1.0"] => has_format = true,
-                ["format", "ascii", "1.0"] => (has_format, header.is_ascii) = (true, true),
-                ["format", ..] => return Err(format!("line {}: `{}` is not supported", number + 1, text.trim())),
-                ["end_header"] if !line.ends_with(b"\n") => return Err("the header has no end".into()),
-                ["end_header"] if has_format => return Ok(header),
-                ["end_header"] => return Err("no line says the format".into()),
-                [] | ["comment" | "obj_info", ..] => {}
-                _ => header.line(&words).map_err(|what| format!("line {}: {what}", number + 1))?,
-            }
+            let read = match words[..] {
+                ["ply"] if header.lines == 1 => Ok(()),
+                _ if header.lines == 1 => Err("this is no PLY file".into()),
+                _ if !line.ends_with(b"\n") => Err("the header has no end".into()),
+                ["end_header"] if header.encoding.is_some() => return Ok(header),
+                ["end_header"] => Err("no line says the format".into()),
+                ["format", ref format @ ..] => {
+                    header.encoding = Encoding::parse(format).filter(|encoding| accepted.contains(encoding));
+                    header.encoding.map(drop).ok_or_else(|| format!("`{}` is not supported", text.trim()))
+                }
+                _ => header.line(&words),
+            };
+            read.map_err(|what| HeaderError::Text { line: header.lines, what })?;
         }
-        Err("the header has no end".into())
     }
 
-    /// A line that describes an element or a property.
+    /// A line that describes an element or a property, or neither.
     fn line(&mut self, words: &[&str]) -> Result<(), String> {
-        let element = |count: &str| {
-            let count = count.parse().map_err(|_| format!("`{count}` is no number of elements"))?;
-            Ok::<_, String>(Element { count, ..Element::default() })
-        };
+        let text = words.join(" ");
         match *words {
-            ["element", "vertex", count] if self.vertex.is_none() && self.face.is_none() => self.vertex = Some(element(count)?),
-            ["element", "face", count] if self.vertex.is_some() && self.face.is_none() => self.face = Some(element(count)?),
-            // What follows the faces is not read.
-            ["element", ..] if self.face.is_some() => self.is_past_faces = true,
-            ["property", ..] if self.is_past_faces => {}
-            ["property", ..] if self.vertex.is_none() => return Err("a property without an element".into()),
-            ["property", "list", length, kind, name] if self.face.is_some() => {
-                self.add(name, Scalar::parse(kind)?, Some(Scalar::parse(length)?));
+            [] | ["obj_info", ..] => {}
+            ["comment", ..] => self.comments.push(text),
+            ["element", name, count] => {
+                let count = count.parse().map_err(|_| format!("`{count}` is no number of elements"))?;
+                self.elements.push(Element { name: name.into(), count, properties: Vec::new(), line: self.lines });
             }
-            ["property", kind, name] => self.add(name, Scalar::parse(kind)?, None),
-            _ => return Err(format!("`{}` is not understood", words.join(" "))),
+            ["property", ref property @ ..] => match self.elements.last_mut() {
+                Some(element) => element.add(property)?,
+                None => return Err(format!("`{text}` is not understood")),
+            },
+            _ => return Err(format!("`{text}` is not understood")),
         }
         Ok(())
-    }
-
-    fn add(&mut self, name: &str, kind: Scalar, length: Option<Scalar>) {
-        let Some(element) = self.face.as_mut().or(self.vertex.as_mut()) else { return };
-        let (offset, index) = (element.stride, element.properties.len());
-        element.properties.push(Property { name: name.into(), kind, length, offset, index });
-        element.stride += if length.is_none() { kind.bytes() } else { 0 };
     }
 }
 
@@ -165,18 +225,21 @@ pub(crate) struct Vertices {
 }
 
 impl Vertices {
-    /// Those of a file without regard to its faces; errors say what is wrong with it.
+    /// Those of a file, of which they are the first element; errors say what is wrong with it.
     pub fn parse(bytes: &[u8]) -> Result<Self, String> {
-        Ok(Self::after(&Header::parse(bytes)?, bytes)?.0)
+        let header = Header::read(&mut &*bytes, &[Encoding::Ascii, Encoding::BinaryLittleEndian]);
+        Ok(Self::after(&header.map_err(|error| error.to_string())?, bytes)?.0)
     }
 
-    /// Those that follow a file's header, and the bytes behind them.
+    /// Those that follow a file's header, and the bytes after them.
     pub fn after<'a>(header: &Header, bytes: &'a [u8]) -> Result<(Self, &'a [u8]), String> {
-        let element = header.vertex.as_ref().ok_or("it has no vertices")?;
+        let element = header.elements.first().filter(|element| element.name == "vertex");
+        let element = element.ok_or("it does not begin with vertices")?;
+        let stride = element.stride()?;
         let columns = Columns::of(element)?;
         let body = &bytes[header.bytes..];
         let mut vertices = Self::default();
-        if header.is_ascii {
+        if header.encoding == Some(Encoding::Ascii) {
             let text = std::str::from_utf8(body).map_err(|_| "it says that it is ASCII, and is not")?;
             let mut lines = text.lines().filter(|line| !line.trim().is_empty());
             for index in 0..element.count {
@@ -186,10 +249,10 @@ impl Vertices {
             }
             return Ok((vertices, &[]));
         }
-        let size = element.count.checked_mul(element.stride).filter(|size| *size <= body.len()).ok_or("it is cut off")?;
+        let size = element.count.checked_mul(stride).filter(|size| *size <= body.len()).ok_or("it is cut off")?;
         let (rows, rest) = body.split_at(size);
-        for row in rows.chunks_exact(element.stride) {
-            vertices.push(&columns, |property| property.kind.read(&row[property.offset..]))?;
+        for row in rows.chunks_exact(stride) {
+            vertices.push(&columns, |property| property.read(row))?;
         }
         Ok((vertices, rest))
     }

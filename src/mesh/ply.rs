@@ -4,7 +4,7 @@
 //! indices. Polygons become fans. Left out: ASCII and big-endian files, and elements beside these two.
 
 use super::Mesh;
-use crate::files::ply::{Element, Header, Property, Scalar, Vertices};
+use crate::files::ply::{Element, Encoding, Header, Property, Scalar, Vertices};
 
 /// The whole file.
 pub(super) fn encode(mesh: &Mesh) -> Vec<u8> {
@@ -29,14 +29,12 @@ pub(super) fn encode(mesh: &Mesh) -> Vec<u8> {
 
 /// Reads a file; errors say what is wrong with it.
 pub(super) fn decode(bytes: &[u8]) -> Result<Mesh, String> {
-    let header = Header::parse(bytes)?;
-    if header.is_ascii {
-        return Err("`format ascii 1.0` is not supported".into());
-    }
+    let header = Header::read(&mut &*bytes, &[Encoding::BinaryLittleEndian]).map_err(|error| error.to_string())?;
     let (Vertices { positions, colors }, faces) = Vertices::after(&header, bytes)?;
-    let face = header.face.ok_or("it has no faces, so it is a map or a cloud of points")?;
+    let face = header.elements.get(1).filter(|element| element.name == "face");
+    let face = face.ok_or("its vertices are not followed by faces: it is a map or a cloud of points")?;
     let mut mesh = Mesh { vertices: positions, colors, ..Mesh::default() };
-    read_faces(&face, faces, &mut mesh)?;
+    read_faces(face, faces, &mut mesh)?;
     Ok(mesh)
 }
 
