@@ -41,12 +41,14 @@ pub struct Outlook {
     rate: f64,
     /// Seconds and frames when it was measured.
     last: Option<(f64, usize)>,
+    /// Seconds at the first look at the refinement, moved by pauses.
+    refining_since: Option<f64>,
 }
 
 impl Outlook {
     /// Of a run over so many frames, and the refinement after them, that begins now.
     pub fn new(all_frames: usize, refine: &RefineConfig) -> Self {
-        Self { started: Instant::now(), all_frames, refine: refine.clone(), rate: 0.0, last: None }
+        Self { started: Instant::now(), all_frames, refine: refine.clone(), rate: 0.0, last: None, refining_since: None }
     }
 
     /// Looks at the run; to be called every now and then.
@@ -57,11 +59,16 @@ impl Outlook {
         let frames = tracking.frames_done;
         let paused = progress.control().is_paused();
         if paused {
-            // Its time is none of the rate's.
+            // Its time is none of the rate's, and none of the refinement's.
+            let held = s - self.last.map_or(s, |(last, _)| last);
+            self.refining_since = self.refining_since.map(|since| since + held);
             self.last = Some((s, frames));
         }
         self.measure(s, frames);
-        let left_s = self.left_s(frames, &mapping).filter(|_| !paused);
+        if mapping.refinement.is_some() {
+            self.refining_since.get_or_insert(s);
+        }
+        let left_s = self.left_s(s, frames, &mapping).filter(|_| !paused);
         RunState { s, frames, all_frames: self.all_frames, tracking, mapping, rate: self.rate, left_s, paused }
     }
 
@@ -77,11 +84,11 @@ impl Outlook {
         self.last = Some((s, frames));
     }
 
-    /// Frames that are left at the present rate, and the refinement's steps.
-    fn left_s(&self, frames: usize, mapping: &MappingProgress) -> Option<f64> {
+    /// Frames that are left at the present rate, and the refinement's steps or its time; `s`: seconds since the run began.
+    fn left_s(&self, s: f64, frames: usize, mapping: &MappingProgress) -> Option<f64> {
         match mapping.refinement {
             Some((done, Some(planned))) => Some((planned - done) as f64 * mapping.step_ms / 1e3),
-            Some((_, None)) => None,
+            Some((_, None)) => Some(self.refining_since? + self.refine.seconds? - s).filter(|left| *left >= 0.0),
             None => (self.rate > 0.0).then(|| {
                 let frames_s = self.all_frames.saturating_sub(frames) as f64 / self.rate;
                 frames_s + self.refinement_s(frames, mapping)
@@ -136,10 +143,16 @@ mod tests {
         outlook.measure(2.0, 20);
         let mapping = MappingProgress { keyframes: 10, gaussians: 5, psnr_db: 21.5, step_ms: 20.0, ..MappingProgress::default() };
         // 80 frames at 10 a second, and three epochs over 50 keyframes.
-        assert_eq!(outlook.left_s(20, &mapping), Some(8.0 + 3.0));
+        assert_eq!(outlook.left_s(2.0, 20, &mapping), Some(8.0 + 3.0));
         let refining = MappingProgress { refinement: Some((50, Some(250))), ..mapping };
-        assert_eq!(outlook.left_s(100, &refining), Some(4.0));
-        assert_eq!(outlook.left_s(100, &MappingProgress { refinement: Some((50, None)), ..mapping }), None);
+        assert_eq!(outlook.left_s(10.0, 100, &refining), Some(4.0));
+        // Bounded by time, and beyond it where the user keeps refining.
+        let endless = MappingProgress { refinement: Some((50, None)), ..mapping };
+        assert_eq!(outlook.left_s(30.0, 100, &endless), None);
+        outlook.refine.seconds = Some(60.0);
+        outlook.refining_since = Some(10.0);
+        assert_eq!(outlook.left_s(30.0, 100, &endless), Some(40.0));
+        assert_eq!(outlook.left_s(71.0, 100, &endless), None);
         let state = RunState { rate: 10.0, mapping, left_s: Some(83.0), ..RunState::default() };
         assert_eq!(state.line(), "10.0/s  0 keyframes  5 Gaussians  21.5 dB  1:23 min left");
         let lost = TrackingProgress { lost: true, ..TrackingProgress::default() };
