@@ -106,8 +106,13 @@ impl Element {
     pub fn stride(&self) -> Result<usize, String> {
         match self.properties.iter().find(|property| property.length.is_some()) {
             Some(list) => Err(format!("the property `{}` of a {} is a list", list.name, self.name)),
-            None => Ok(self.properties.last().map_or(0, |last| last.offset + last.kind.bytes())),
+            None => Ok(self.end()),
         }
+    }
+
+    /// Where its last property ends.
+    fn end(&self) -> usize {
+        self.properties.last().map_or(0, |last| last.offset + last.kind.bytes())
     }
 
     /// Adds a property by the words after `property`.
@@ -120,8 +125,8 @@ impl Element {
         if self.properties.iter().any(|known| known.name == name) {
             return Err(format!("the property `{name}` is there twice"));
         }
-        let offset = self.properties.last().map_or(0, |last| last.offset + last.kind.bytes());
-        let property = Property { name: name.into(), kind: Scalar::parse(kind)?, length, offset, index: self.properties.len() };
+        let kind = Scalar::parse(kind)?;
+        let property = Property { name: name.into(), kind, length, offset: self.end(), index: self.properties.len() };
         self.properties.push(property);
         Ok(())
     }

@@ -251,6 +251,35 @@ fn touch(page: &mut Page) {
     assert!(q.angle_to(&turned) < 1e-6 && moved.x < 0.0 && moved.y < 0.0 && moved.z.abs() < 0.1 * moved.norm(), "{moved}");
 }
 
+/// A comparison, a measurement and the help, by keys. Not all comparisons in a report have both pictures.
+fn keys(page: &mut Page, both: bool) {
+    page.evaluate("document.querySelector('#viewer canvas').focus()");
+    page.press("]", "BracketRight", 221);
+    page.wait_until("[...document.querySelectorAll('#viewer .compare')].some(element => !element.hidden)");
+    if both {
+        next_keyframe(page);
+    }
+    page.press("Escape", "Escape", 27);
+    page.wait_until("[...document.querySelectorAll('#viewer .compare')].every(element => element.hidden)");
+    page.press("m", "KeyM", 77);
+    page.wait_until(
+        "/keyframes see the point|no Gaussian at this point/.test(document.querySelector('#viewer .note').textContent)",
+    );
+    page.press("?", "Slash", 191);
+    page.wait_until("document.querySelector('#viewer dialog[open]') !== null");
+    page.press("Escape", "Escape", 27);
+}
+
+/// From one keyframe's comparison to the next, whose pictures are not there at once: no other is shown in their place.
+fn next_keyframe(page: &mut Page) {
+    const BOTH: &str = "document.querySelector('#viewer .pair.both') !== null";
+    const NEXT: &str = "document.querySelector('#viewer .compare [aria-label^=\"Next keyframe\"]').click(), \
+                        [...document.querySelectorAll('#viewer .pair > canvas')].every(canvas => canvas.hidden)";
+    page.wait_until(BOTH);
+    assert_eq!(page.evaluate(NEXT), true);
+    page.wait_until(BOTH);
+}
+
 /// The page draws what our rasterizer draws, from a server and, of an antialiased map, from a report's file; by keyboard and touch, on a phone and on a desk.
 #[test]
 fn a_browser_draws_the_map_as_we_do() {
@@ -295,19 +324,7 @@ fn a_browser_draws_the_map_as_we_do() {
         }
         page.screenshot(&scratch().join(format!("page-{width}.png")));
         touch(&mut page);
-        let steps = |page: &mut Page| page.press("]", "BracketRight", 221);
-        page.evaluate("document.querySelector('#viewer canvas').focus()");
-        steps(&mut page);
-        page.wait_until("[...document.querySelectorAll('#viewer .compare')].some(element => !element.hidden)");
-        page.press("Escape", "Escape", 27);
-        page.wait_until("[...document.querySelectorAll('#viewer .compare')].every(element => element.hidden)");
-        page.press("m", "KeyM", 77);
-        page.wait_until(
-            "/keyframes see the point|no Gaussian at this point/.test(document.querySelector('#viewer .note').textContent)",
-        );
-        page.press("?", "Slash", 191);
-        page.wait_until("document.querySelector('#viewer dialog[open]') !== null");
-        page.press("Escape", "Escape", 27);
+        keys(&mut page, address == &serving.url);
         assert!(page.complaints.is_empty(), "{:?}", page.complaints);
     }
 }

@@ -13,8 +13,8 @@ export class Compare {
   // `hooks`: `ask(id)` requests a recorded picture, `closed()`, `step(by)` goes to another keyframe, `exact(id, camera)` or null.
   constructor(parent, stage, scene, hooks) {
     Object.assign(this, { stage, scene, hooks, id: null, pictures: new Map(), camera: null, kept: KEPT_PICTURES });
-    this.rendered = element("canvas", { class: "rendered", role: "img", "aria-label": "Rendered from the map" });
-    this.recorded = element("canvas", { class: "recorded", role: "img", "aria-label": "As recorded" });
+    this.rendered = element("canvas", { class: "rendered", role: "img", "aria-label": "Rendered from the map", hidden: true });
+    this.recorded = element("canvas", { class: "recorded", role: "img", "aria-label": "As recorded", hidden: true });
     this.difference = element("canvas", { class: "difference", role: "img", "aria-label": "Difference, four times brighter", hidden: true });
     this.exact = element("img", { class: "exact", alt: "Error by keysplat", hidden: true });
     this.title = element("b", {});
@@ -51,7 +51,7 @@ export class Compare {
     }
     this.id = id;
     this.camera = null;
-    this.setRecorded(false);
+    this.setShown({ recorded: false, rendered: false });
     this.hideExact();
     this.section.hidden = false;
     this.exactButton.hidden = !(this.scene.hello && this.scene.hello.exact);
@@ -96,21 +96,30 @@ export class Compare {
   }
 
   async showRecorded(image) {
-    await showBlob(this.recorded, image.blob);
-    if (image.id === this.id) {
+    if (await showBlob(this.recorded, image.blob, () => image.id === this.id)) {
+      this.pair.style.setProperty("--shape", this.recorded.width / this.recorded.height);
       this.camera = image.camera || null;
-      this.setRecorded(true);
+      this.setShown({ recorded: true });
       this.say("");
       this.slide();
     }
   }
 
-  // Without a recorded picture there is nothing to slide or to subtract.
-  setRecorded(on) {
-    this.hasRecorded = on;
-    this.recorded.hidden = !on;
-    this.toggle.disabled = !on;
-    this.slider.disabled = !on || this.toggle.checked;
+  // Which pictures of this keyframe are there. One alone is shown whole; there is nothing to slide or to subtract.
+  setShown({ recorded = !this.recorded.hidden, rendered = !this.rendered.hidden }) {
+    this.recorded.hidden = !recorded;
+    this.rendered.hidden = !rendered;
+    this.pair.classList.toggle("both", this.hasBoth);
+    this.toggle.disabled = !this.hasBoth;
+    this.slider.disabled = !this.hasBoth || this.toggle.checked;
+  }
+
+  get hasRecorded() {
+    return !this.recorded.hidden;
+  }
+
+  get hasBoth() {
+    return this.hasRecorded && !this.rendered.hidden;
   }
 
   refused({ what, why }) {
@@ -125,9 +134,9 @@ export class Compare {
 
   showDifference(on) {
     this.toggle.checked = on;
-    this.slider.disabled = on || !this.hasRecorded;
+    this.slider.disabled = on || !this.hasBoth;
     this.hideExact();
-    this.difference.hidden = !on || !this.hasRecorded;
+    this.difference.hidden = !on || !this.hasBoth;
   }
 
   // The pose or the map has changed.
@@ -154,6 +163,7 @@ export class Compare {
       return;
     }
     showBytes(this.rendered, picture);
+    this.setShown({ rendered: true });
     this.pair.style.setProperty("--shape", picture.width / picture.height);
     if (this.hasRecorded && this.recorded.width === picture.width) {
       this.measure(picture);

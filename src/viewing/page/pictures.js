@@ -14,12 +14,17 @@ export function showBytes(canvas, picture) {
   canvas.getContext("2d").putImageData(new ImageData(bytes, picture.width, picture.height), 0, 0);
 }
 
-export async function showBlob(canvas, blob) {
+// Shows a picture that must be decoded, unless it is not wanted any more by then; returns whether it did.
+export async function showBlob(canvas, blob, wanted = () => true) {
   const bitmap = await createImageBitmap(blob);
+  if (!wanted()) {
+    return false;
+  }
   canvas.width = bitmap.width;
   canvas.height = bitmap.height;
   canvas.getContext("2d", { willReadFrequently: true }).drawImage(bitmap, 0, 0);
   bitmap.close();
+  return true;
 }
 
 // Calls `act` at most once in a while, and once more after the last call. An act that takes long comes the more seldom.
