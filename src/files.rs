@@ -41,10 +41,14 @@ pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), WriteError> {
 /// As [`write_atomically`].
 pub fn write_durably(path: &Path, bytes: &[u8]) -> Result<(), WriteError> {
     write(path, bytes, std::fs::File::sync_all)?;
-    // The rename is the folder's to keep; not every system opens folders as files.
-    let folder = path.parent().and_then(|folder| std::fs::File::open(folder).ok());
-    let _ = folder.map(|folder| folder.sync_all());
+    // The rename is the folder's to keep.
+    path.parent().into_iter().for_each(sync_folder);
     Ok(())
+}
+
+/// Flushes a folder's names to the disk, where the system opens folders as files.
+pub fn sync_folder(folder: &Path) {
+    let _ = std::fs::File::open(folder).map(|folder| folder.sync_all());
 }
 
 /// Removes what writes that were killed left in a folder, as far as that is possible.

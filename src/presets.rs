@@ -17,7 +17,7 @@ use crate::render::BlendForm;
 pub enum Preset {
     /// Keep up with the recording's own frame rate: resolution and steps follow from the adapter's speed.
     Realtime,
-    /// Few steps: 2 a keyframe, and 4 epochs at the end.
+    /// Few steps: 2 a keyframe, and 5 epochs at the end.
     Draft,
     /// The defaults.
     Balanced,

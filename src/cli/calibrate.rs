@@ -68,9 +68,6 @@ pub fn find_camera(
         return Err(miette!("{} has {len} frames; give --frames within them", path.display()));
     }
     let Pinhole { width, height, .. } = sequence.camera.pinhole;
-    if sequence.camera != Camera::assumed(width, height) {
-        return Err(miette!("{} has a calibration, which its layout always uses: leave --camera out", path.display()));
-    }
     let config = TrackingConfig::default();
     let front_end = FrontEnd::new(Camera::assumed(width, height), sequence.sensor, &config);
     let bar = progress::bar(verbosity, (end - start) as u64, "{wide_bar} {pos}/{len} frames read");

@@ -14,7 +14,7 @@ use super::{Verbosity, progress};
 pub struct GenerateArgs {
     /// Scene description (see `sequences/`).
     scene: PathBuf,
-    /// Folder to write the recording to, in TUM's layout.
+    /// Folder to write the recording to, in TUM's layout, or in KITTI's if it is stereo.
     #[arg(short, long, required_unless_present = "surface")]
     out: Option<PathBuf>,
     /// Mesh to write the exact surface to, as far as the camera sees it: .ply, .glb or .obj.

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::{Args, Subcommand};
-use keysplat::jobs::{self, AGAIN, Ended, JobError, Plan, State, WITH_HOLES, kubernetes, local, slurm};
+use keysplat::jobs::{self, AGAIN, Ended, JobError, Plan, WITH_HOLES, kubernetes, local, slurm};
 use miette::{IntoDiagnostic, Report};
 
 pub use work::{inputs_of_run, refining};
@@ -147,8 +147,7 @@ fn submit(args: &SubmitArgs, verbosity: Verbosity) -> Result<End, JobError> {
     if args.engine.print_k8s {
         return Ok(End::well(kubernetes::to_yaml(&plan)));
     }
-    let open: Vec<usize> =
-        jobs::status(&plan, &Default::default()).iter().filter(|t| t.state != State::Done).map(|t| t.task).collect();
+    let open = jobs::open_tasks(&plan);
     let program = std::env::current_exe()
         .map_err(|error| JobError::Engine { command: "keysplat jobs run".into(), reason: error.to_string() })?;
     let Some(processes) = args.engine.local else {

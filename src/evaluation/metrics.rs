@@ -10,7 +10,7 @@ use crate::sequence::SensorKind;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-use crate::files::{WriteError, write_atomically};
+use crate::files::{WriteError, write_durably};
 
 /// Everything that is known about a run. Field names carry their units.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -275,7 +275,7 @@ pub fn sha256_hex(bytes: &[u8]) -> String {
 pub fn write_json(metrics: &Metrics, path: &Path) -> Result<(), WriteError> {
     let mut text = serde_json::to_string_pretty(metrics).expect("metrics are numbers and strings, which JSON can hold");
     text.push('\n');
-    write_atomically(path, text.as_bytes())
+    write_durably(path, text.as_bytes())
 }
 
 /// A figure with its decimals and unit, or a dash.

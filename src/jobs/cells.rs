@@ -2,6 +2,7 @@
 
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
@@ -9,7 +10,7 @@ use super::input::create_folder;
 use super::merge::read;
 use super::task::result_folder;
 use super::{CellTask, JobError, Plan, Work};
-use crate::export::{ExportError, MapFormat};
+use crate::export::MapFormat;
 use crate::files::write_atomically;
 use crate::geometry::{Se3, Trajectory};
 use crate::partition::Place;
@@ -40,9 +41,11 @@ impl CellRow {
 /// Writes the run with the refined cells in the place of its own, and one table. A cell without a result keeps the run's Gaussians.
 pub(super) fn merge(plan: &Plan, done: &[usize]) -> Result<String, JobError> {
     let cells: Vec<(usize, &CellTask)> = plan.tasks.iter().enumerate().filter_map(of_cell).collect();
-    let Some((_, first)) = cells.first() else { return Ok(String::new()) };
+    let Some((number, first)) = cells.first() else { return Ok(String::new()) };
     let is_done: Vec<bool> = cells.iter().map(|(number, _)| done.contains(number)).collect();
     let run = plan.folder().join(&first.run);
+    // The cells are of the map that was planned.
+    plan.verify_inputs(plan.task(*number)?)?;
     let (whole, format) = map_of(&run)?;
     let mut table = String::from("| cell | keyframes | steps | Gaussians before | after | s |\n|---|---|---|---|---|---|\n");
     let owner = |i: usize| cells.iter().position(|(_, cell)| cell.region.place(whole.means[i]) == Place::Core);
@@ -70,9 +73,8 @@ pub(super) fn merge(plan: &Plan, done: &[usize]) -> Result<String, JobError> {
     for name in [outputs::CONFIG, outputs::TRAJECTORY, outputs::KEYFRAMES, outputs::EXPOSURES] {
         copy(&run.join(name), &folder.join(name))?;
     }
-    let export = |error: ExportError| JobError::Work { reason: error.to_string(), is_bad_input: false };
-    format.write_for(&merged, &poses(&run.join(outputs::KEYFRAMES)), &folder.join(outputs::map_name(format))).map_err(export)?;
-    let _ = writeln!(table, "\n{} Gaussians in {}", merged.len(), folder.display());
+    let merged = outputs::write_map(&folder, format, &Arc::new(merged), &poses(&run.join(outputs::KEYFRAMES)))?;
+    let _ = writeln!(table, "\n{} Gaussians in {}", merged.cloud.len(), folder.display());
     Ok(table)
 }
 

@@ -22,7 +22,7 @@ pub use cells::CellRow;
 pub use input::Input;
 pub use merge::{Hole, Merge, merge};
 pub use plan::{CellTask, Draft, Plan, ReplayTask, RunTask, Task, Work};
-pub use status::{State, TaskStatus, digest, status, to_table};
+pub use status::{State, TaskStatus, digest, open_tasks, status, to_table};
 pub use task::{Ended, Made, TaskResult, WorkError, run_task};
 
 use crate::files::WriteError;

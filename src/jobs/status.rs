@@ -48,6 +48,11 @@ pub fn status(plan: &Plan, engine: &BTreeMap<usize, SlurmState>) -> Vec<TaskStat
     tasks.map(one).collect()
 }
 
+/// The tasks whose result is missing or damaged.
+pub fn open_tasks(plan: &Plan) -> Vec<usize> {
+    (0..plan.tasks.len()).filter(|number| TaskResult::verified(plan, *number).is_err()).collect()
+}
+
 fn state(plan: &Plan, number: usize, engine: Option<&SlurmState>) -> (State, String) {
     if TaskResult::find(plan, number).is_some() {
         return (State::Done, String::new());

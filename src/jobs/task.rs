@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use super::input::{create_folder, sha256_of};
 use super::{JobError, Plan, Task};
 use crate::evaluation::sha256_hex;
-use crate::files::{WriteError, write_durably};
+use crate::files::{WriteError, sync_folder, write_durably};
 use crate::run_folder::{FolderLock, OutputError, outputs};
 
 const WORKING: &str = "working";
@@ -224,7 +224,9 @@ fn commit(plan: &Plan, task: &Task, folder: &Path, made: Made) -> Result<(), Job
     write_durably(&working.join(RESULT_FILE), text.as_bytes())?;
     // What is there does not match: it was verified before the work.
     remove_folder(&result)?;
-    std::fs::rename(&working, &result).map_err(|source| JobError::Folder { action: "rename", path: working, source })
+    std::fs::rename(&working, &result).map_err(|source| JobError::Folder { action: "rename", path: working, source })?;
+    sync_folder(folder);
+    Ok(())
 }
 
 impl Attempts {

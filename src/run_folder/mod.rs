@@ -4,6 +4,7 @@ mod checkpoint;
 mod checkpointer;
 mod history;
 mod lock;
+mod map_file;
 mod message_digest;
 pub mod outputs;
 mod result;

@@ -7,6 +7,7 @@ use std::sync::{Arc, OnceLock};
 use image::{GenericImage, RgbImage};
 use serde::Serialize;
 
+pub use super::map_file::{WrittenMap, find_map, map_name, write_map};
 use super::{FolderLock, RunResult};
 use crate::evaluation::metrics::{
     Adapter, AteFigures, DepthBiasFigures, ImageProtocols, MappingFigures, Metrics, RpeFigures, Times, UsualTimes,
@@ -15,8 +16,8 @@ use crate::evaluation::views::{ComparedView, ViewSelection, ViewSource, evaluate
 use crate::evaluation::{
     Alignment, Comparison, Exposures, draw_trajectory, evaluate_trajectory, machine, sha256_hex, write_json,
 };
-use crate::export::{ExportError, MapFormat};
-use crate::files::{WriteError, remove_partials, write_atomically};
+use crate::export::ExportError;
+use crate::files::{WriteError, remove_partials, write_atomically, write_durably};
 use crate::geometry::{Se3, Trajectory};
 use crate::gpu::{Gpu, GpuError};
 use crate::recording::Recording;
@@ -105,23 +106,9 @@ pub fn prepare_folder(out: &Path) -> Result<FolderLock, OutputError> {
     let folder_error = |source| OutputError::Folder { path: out.into(), source };
     std::fs::create_dir_all(out.join(VIEWS)).map_err(folder_error)?;
     let lock = FolderLock::take(out)?;
-    remove_partials(out);
+    [out, &out.join(VIEWS)].into_iter().for_each(remove_partials);
     std::fs::write(&probe, b"").and_then(|()| std::fs::remove_file(&probe)).map_err(folder_error)?;
     Ok(lock)
-}
-
-/// File name of a map.
-pub fn map_name(format: MapFormat) -> String {
-    format!("map.{}", format.extension())
-}
-
-/// The map in a run's folder, or the file itself, and its format, if there is one.
-pub fn find_map(folder: &Path) -> Option<(PathBuf, MapFormat)> {
-    if !folder.is_dir() {
-        return MapFormat::of_path(folder).map(|format| (folder.into(), format));
-    }
-    let in_folder = |format: &MapFormat| (folder.join(map_name(*format)), *format);
-    MapFormat::all().iter().map(in_folder).find(|(path, _)| path.is_file())
 }
 
 /// Removes the checkpoint of a finished run.
@@ -132,7 +119,7 @@ pub fn remove_checkpoint(out: &Path) -> Result<(), OutputError> {
     remove_file(&out.join(CHECKPOINT))
 }
 
-fn remove_file(path: &Path) -> Result<(), OutputError> {
+pub(super) fn remove_file(path: &Path) -> Result<(), OutputError> {
     match std::fs::remove_file(path) {
         Err(source) if source.kind() != std::io::ErrorKind::NotFound => Err(OutputError::Remove { path: path.into(), source }),
         _ => Ok(()),
@@ -149,40 +136,23 @@ fn remove_pictures(out: &Path) -> Result<(), OutputError> {
     Ok(())
 }
 
-/// Size and hash of a map file.
-#[derive(Clone, Debug)]
-pub struct WrittenMap {
-    /// Size, bytes.
-    pub bytes: u64,
-    /// SHA-256, hexadecimal.
-    pub hash: String,
-    /// The map as the file holds it.
-    pub cloud: Arc<GaussianCloud>,
-}
-
-/// Writes trajectories, map, records and the resolved configuration. Metrics of an earlier run in the same folder are removed first: they
+/// Writes trajectories, map, records and the resolved configuration to the disk itself: a checkpoint is of no use then. Metrics of an earlier run in the same folder are removed first: they
 /// would belong to another map.
 ///
 /// # Errors
 /// If a file cannot be written, or the map holds a value that is not finite.
 pub fn write_results(out: &Path, recording: &Recording, result: &RunResult) -> Result<WrittenMap, OutputError> {
     remove_file(&out.join(METRICS))?;
-    write_atomically(&out.join(TRAJECTORY), result.trajectory.to_tum().as_bytes())?;
-    write_atomically(&out.join(KEYFRAMES), result.keyframe_trajectory().to_tum().as_bytes())?;
-    write_atomically(&out.join(CONFIG), recording.config().to_toml().as_bytes())?;
+    write_durably(&out.join(TRAJECTORY), result.trajectory.to_tum().as_bytes())?;
+    write_durably(&out.join(KEYFRAMES), result.keyframe_trajectory().to_tum().as_bytes())?;
+    write_durably(&out.join(CONFIG), recording.config().to_toml().as_bytes())?;
     write_records(&out.join(HISTORY), &result.history)?;
     remove_file(&out.join(EXPOSURES))?;
     if recording.config().mapping.exposure.enabled {
         write_records(&out.join(EXPOSURES), &result.exposures())?;
     }
-    for format in MapFormat::all() {
-        remove_file(&out.join(map_name(*format)))?;
-    }
-    let format = recording.config().map_format;
     let poses: Vec<Se3> = result.keyframes.iter().map(|keyframe| keyframe.world_from_camera).collect();
-    let bytes = format.write_for(&result.cloud, &poses, &out.join(map_name(format)))?;
-    let cloud = if format.is_lossless() { result.cloud.clone() } else { Arc::new(format.decode(&bytes)?) };
-    Ok(WrittenMap { bytes: bytes.len() as u64, hash: sha256_hex(&bytes), cloud })
+    write_map(out, recording.config().map_format, &result.cloud, &poses)
 }
 
 /// Errors of a trajectory and a map against their recording.
@@ -313,7 +283,7 @@ pub fn picture_name(frame: usize) -> String {
 
 fn write_records(path: &Path, records: &impl Serialize) -> Result<(), WriteError> {
     let text = serde_json::to_string(records).expect("records are numbers, which JSON can hold");
-    write_atomically(path, text.as_bytes())
+    write_durably(path, text.as_bytes())
 }
 
 /// Recorded left, rendered right.

@@ -106,6 +106,14 @@ pub enum SequenceError {
         /// The name given.
         name: String,
     },
+    /// A camera is named for a recording that has its own.
+    #[error("{folder}: recordings in the layout {layout} have their own calibration, which is always used; leave --camera out")]
+    OwnCamera {
+        /// The recording.
+        folder: PathBuf,
+        /// Name of its layout.
+        layout: &'static str,
+    },
     /// An image's size is not the camera's.
     #[error("{path} is {found_width}x{found_height}, but the camera is {width}x{height}; images, depth and camera must agree")]
     Size {

@@ -173,6 +173,11 @@ fn options() {
     run(&["--map-scale", "1.5"]).refused(&["map_scale must be above 0 and at most 1, not 1.5"]);
     run(&["--camera", "nosuch"]).refused(&["no camera is called `nosuch`", "tum-fr1"]);
     assert!(!scratch().join("never-either").exists());
+    let calibrated = scratch().join("calibrated");
+    std::fs::create_dir_all(calibrated.join("image_0")).unwrap();
+    std::fs::write(calibrated.join("calib.txt"), "").unwrap();
+    finish(run_command(&calibrated, &scratch().join("never-either"), &["--camera", "tum-fr1"]))
+        .refused(&["the layout kitti have their own calibration", "leave --camera out"]);
 }
 
 #[test]

@@ -20,8 +20,8 @@ fn finished_run() -> &'static Path {
     })
 }
 
-fn split(plan: &Path) -> Finished {
-    let mut command = keysplat(["split", finished_run().to_str().unwrap(), "--max-gaussians", "3000", "--halo", "0.5", "--out"]);
+fn split(run: &Path, plan: &Path) -> Finished {
+    let mut command = keysplat(["split", run.to_str().unwrap(), "--max-gaussians", "3000", "--halo", "0.5", "--out"]);
     command.arg(plan).args(["--", "--set", "mapping.refine.final_epochs=6", "--set", "mapping.refine.density_every=50"]);
     command.args(["--checkpoint-every", "1"]);
     finish(command)
@@ -48,13 +48,13 @@ fn cells_make_the_same_map_whatever_happens_and_a_hole_keeps_the_run() {
         return;
     }
     let (plan, killed) = (scratch().join("plan"), scratch().join("killed-plan"));
-    let planned = split(&plan).succeeded().stdout;
+    let planned = split(finished_run(), &plan).succeeded().stdout;
     let tasks: usize = planned.split(' ').next().unwrap().parse().unwrap();
     assert!((2..20).contains(&tasks), "{planned}");
     let merged = jobs("submit", &plan, &["--local", "2"]).succeeded().stdout;
     assert!(merged.contains("Gaussians before"), "{merged}");
 
-    split(&killed).succeeded();
+    split(finished_run(), &killed).succeeded();
     let checkpoint = killed.join("tasks/0000/working/checkpoint.bin");
     let mut command = keysplat(["jobs", "run", killed.to_str().unwrap(), "--task", "0"]);
     let mut child = command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
@@ -83,6 +83,19 @@ fn cells_make_the_same_map_whatever_happens_and_a_hole_keeps_the_run() {
     let kept = left.len() - (all.len() - core.len());
     let of_run = left.means.iter().filter(|mean| whole.means.contains(mean)).count();
     assert!(kept > 0 && of_run >= kept && left.means != all.means, "{kept} {of_run}");
+}
+
+#[test]
+fn cells_are_not_merged_into_another_map() {
+    if skipped_without_adapter() {
+        return;
+    }
+    let (run, plan) = (scratch().join("mapped-again"), scratch().join("mapped-again-plan"));
+    crate::common::recording::copy_folder(finished_run(), &run);
+    split(&run, &plan).succeeded();
+    jobs("run", &plan, &["--task", "0"]).succeeded();
+    std::fs::copy(run.join("trajectory.txt"), run.join("keyframes.txt")).unwrap();
+    jobs("merge", &plan, &["--allow-holes"]).refused(&["keyframes.txt", "is not what it was"]);
 }
 
 #[test]

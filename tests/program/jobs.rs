@@ -100,6 +100,13 @@ fn killed_and_interrupted_tasks_merge_to_the_table_of_the_sweep() {
     assert!(digest.is_string());
     finish(jobs("submit", &plan, &["--local", "1"])).succeeded();
     assert_eq!(states(&plan)["digest"], digest);
+    // A damaged result is made anew.
+    let map = plan.join("tasks/0000/result/map.ply");
+    truncate(&map, 100);
+    finish(jobs("merge", &plan, &[])).refused(&["map.ply is damaged"]);
+    finish(jobs("submit", &plan, &["--local", "1"])).succeeded();
+    assert_eq!(states(&plan)["digest"], digest);
+    assert!(std::fs::metadata(&map).unwrap().len() > 100);
 }
 
 #[test]

@@ -17,7 +17,7 @@ use super::super::run::RunArgs;
 pub(super) struct AblationArgs {
     #[command(flatten)]
     run: RunArgs,
-    /// A variant: its name and the settings in which it differs, e.g. "no pruning: mapping.prune.min_opacity=0" (may be given again).
+    /// A variant: its name and the settings in which it differs, e.g. "no pruning: mapping.density.min_opacity=0" (may be given again).
     #[arg(long = "variant", value_name = "NAME: KEY=VALUE …", value_parser = parse_variant)]
     variants: Vec<Variant>,
     /// Epochs after the last keyframe: every variant is run with each of these numbers, which gives it a curve.

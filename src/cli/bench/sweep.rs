@@ -1,5 +1,6 @@
 //! `keysplat bench sweep` and `keysplat bench compare`
 
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
@@ -147,8 +148,7 @@ fn settings(args: &SweepArgs) -> Vec<(String, Vec<String>)> {
 
 fn cells(args: &SweepArgs, folder: &Path, verbosity: Verbosity) -> miette::Result<Vec<Cell>> {
     let mut cells = Vec::new();
-    for sequence in &args.sequences {
-        let (name, recording) = recording(sequence, folder, verbosity)?;
+    for (name, recording) in recordings(&args.sequences, folder, verbosity)? {
         for (variant, settings) in settings(args) {
             for &seed in &args.seeds {
                 let of_seed = ["--set".into(), format!("mapping.seed={seed}")];
@@ -159,7 +159,11 @@ fn cells(args: &SweepArgs, folder: &Path, verbosity: Verbosity) -> miette::Resul
             }
         }
     }
-    Ok(cells)
+    let mut folders = BTreeSet::new();
+    match cells.iter().find(|cell| !folders.insert(&cell.out)) {
+        Some(twice) => Err(miette!("two runs are named {}, {}; give each variant and seed once", twice.sequence, twice.variant)),
+        None => Ok(cells),
+    }
 }
 
 /// A name that any file system takes.
@@ -167,17 +171,34 @@ fn slug(name: &str) -> String {
     name.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '-' }).collect()
 }
 
-/// A recording's name and folder; synthetic scenes are rendered where they are not yet.
-pub(super) fn recording(sequence: &str, out: &Path, verbosity: Verbosity) -> miette::Result<(String, PathBuf)> {
-    let path = Path::new(sequence);
-    if path.exists() {
-        let name = path.file_stem().map_or_else(|| sequence.into(), |name| name.to_string_lossy().into_owned());
-        return Ok((name, path.into()));
-    }
-    let scene = scene(sequence)?;
-    let folder = out.join("recordings").join(sequence);
-    generate::render_if_changed(&scene, &folder, verbosity)?;
-    Ok((sequence.into(), folder))
+/// Recordings with names that tell them apart; synthetic scenes are rendered where they are not yet.
+pub(super) fn recordings(sequences: &[String], out: &Path, verbosity: Verbosity) -> miette::Result<Vec<(String, PathBuf)>> {
+    let recording = |sequence: &String| {
+        let path = PathBuf::from(sequence);
+        if path.exists() {
+            return Ok(path);
+        }
+        let folder = out.join("recordings").join(sequence);
+        generate::render_if_changed(&scene(sequence)?, &folder, verbosity)?;
+        Ok(folder)
+    };
+    let paths = sequences.iter().map(recording).collect::<miette::Result<Vec<_>>>()?;
+    let names = distinct_names(&paths).ok_or_else(|| miette!("a recording is given twice; give each one once"))?;
+    Ok(names.into_iter().zip(paths).collect())
+}
+
+/// The ends of paths, as long as it takes to tell them apart.
+fn distinct_names(paths: &[PathBuf]) -> Option<Vec<String>> {
+    let end = |path: &PathBuf, parts: usize| {
+        let mut parts: Vec<_> =
+            path.with_extension("").iter().rev().take(parts).map(|part| part.to_string_lossy().into_owned()).collect();
+        parts.reverse();
+        parts.join("/")
+    };
+    let most = paths.iter().map(|path| path.iter().count()).max().unwrap_or(1);
+    let names = (1..=most).map(|parts| paths.iter().map(|path| end(path, parts)).collect::<Vec<_>>());
+    let mut distinct = names.filter(|names| names.iter().map(|name| slug(name)).collect::<BTreeSet<_>>().len() == names.len());
+    distinct.next()
 }
 
 /// The synthetic scene of a name.
@@ -249,4 +270,21 @@ pub(super) fn compare(args: &CompareArgs) -> miette::Result<()> {
     print(&table)?;
     let worse = changes.iter().filter(|c| c.verdict == Verdict::Worse).count();
     if args.fail && worse > 0 { Err(miette!("{worse} figures got worse beyond the spread")) } else { Ok(()) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn recordings_are_named_by_what_tells_them_apart() {
+        let names = |paths: &[&str]| distinct_names(&paths.iter().map(PathBuf::from).collect::<Vec<_>>());
+        assert_eq!(names(&["/data/redkitchen", "walk.mp4"]).unwrap(), ["redkitchen", "walk"]);
+        assert_eq!(
+            names(&["chess/seq-01", "fire/seq-01/", "fire/seq-02"]).unwrap(),
+            ["chess/seq-01", "fire/seq-01", "fire/seq-02"]
+        );
+        assert_eq!(names(&["seq-01", "fire/seq-01"]).unwrap(), ["seq-01", "fire/seq-01"]);
+        assert_eq!(names(&["a", "a"]), None);
+    }
 }

@@ -17,7 +17,7 @@ use miette::{IntoDiagnostic, miette};
 use rayon::iter::{IntoParallelRefIterator, ParallelIterator};
 
 use super::ablation::{Variant, parse_variant};
-use super::sweep::{recording, scene};
+use super::sweep::{recordings, scene};
 use crate::cli::{Verbosity, generate, jobs, print, progress};
 
 /// Frames extracted ahead.
@@ -150,10 +150,7 @@ fn open(folder: &Path, sensor: Option<SensorKind>) -> miette::Result<Sequence> {
 
 /// The recordings with their names; one for each sensor, where sensors are given.
 fn sources(args: &TrackArgs, out: &Path, verbosity: Verbosity) -> miette::Result<Vec<Source>> {
-    let mut folders = Vec::new();
-    for sequence in &args.sequences {
-        folders.push(recording(sequence, out, verbosity)?);
-    }
+    let mut folders = recordings(&args.sequences, out, verbosity)?;
     for name in &args.scenes {
         let scene = scene(name)?;
         let frames = scene.frames.min(ROOM_FRAMES);

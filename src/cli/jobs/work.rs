@@ -5,10 +5,10 @@ use std::time::Duration;
 
 use clap::Parser;
 use keysplat::jobs::{CellRow, CellTask, JobError, Made, Plan, ReplayTask, RunTask, Task, Work, WorkError};
-use keysplat::pipeline::Replay;
+use keysplat::pipeline::{PipelineError, Replay};
 use keysplat::report::replays::ReplayRow;
 use keysplat::report::sweep::SweepRow;
-use keysplat::run_folder::{OutputError, outputs};
+use keysplat::run_folder::{CheckpointError, OutputError, outputs};
 use keysplat::{Progress, Session, SessionError};
 use miette::IntoDiagnostic;
 
@@ -122,7 +122,7 @@ fn bad_input(error: impl ToString) -> WorkError {
 fn write_replay(task: &ReplayTask, folder: &Path, signals: &Signals) -> Result<Made, WorkError> {
     let row = track::replay(task, &|| signals.is_leaving()).map_err(bad_input)?.ok_or(WorkError::Interrupted)?;
     let text = serde_json::to_string(&row).map_err(failed)?;
-    keysplat::files::write_atomically(&folder.join(ReplayRow::FILE), text.as_bytes()).map_err(failed)?;
+    keysplat::files::write_durably(&folder.join(ReplayRow::FILE), text.as_bytes()).map_err(failed)?;
     let figures = serde_json::to_value(ReplayRow { ms_per_frame: 0.0, ..row }).map_err(failed)?;
     Ok(Made { figures, files: Vec::new(), timed_files: vec![ReplayRow::FILE.into()] })
 }
@@ -142,14 +142,17 @@ type Finish<'a> = &'a dyn Fn(&Session, Replay) -> Result<(), SessionError>;
 impl Replayed<'_> {
     /// Runs to the end, from a checkpoint if there is one.
     fn make(&self, finish: Finish<'_>) -> Result<(), WorkError> {
-        let done = match self.resume(finish) {
-            Ok(Some(done)) => done,
-            Err(error @ (SessionError::Output(_) | SessionError::Gpu(_))) => return Err(failed(error)),
-            nothing => {
-                // Of another adapter, for example: a result is that of one adapter.
-                nothing.err().iter().for_each(|error| tracing::warn!("{error}; the task begins anew"));
-                self.finish(self.begin()?, finish).map_err(of_session)?
+        let resumed = match self.resume(finish) {
+            // Of another adapter, for example: a result is that of one adapter.
+            Err(error) if is_of_no_use(&error) => {
+                tracing::warn!("{error}; the task begins anew");
+                None
             }
+            resumed => resumed.map_err(of_session)?,
+        };
+        let done = match resumed {
+            Some(done) => done,
+            None => self.finish(self.begin()?, finish).map_err(of_session)?,
         };
         if done { Ok(()) } else { Err(WorkError::Interrupted) }
     }
@@ -183,6 +186,21 @@ impl Replayed<'_> {
         }
         finish(&session, replay)?;
         Ok(true)
+    }
+}
+
+/// Whether nothing can ever be resumed from the checkpoint. It stays where something else failed.
+fn is_of_no_use(error: &SessionError) -> bool {
+    let of_no_use = |error: &CheckpointError| matches!(error, CheckpointError::Damaged { .. } | CheckpointError::Differs { .. });
+    let error = match error {
+        SessionError::Checkpoint(error) => return of_no_use(error),
+        SessionError::Pipeline(error) => error,
+        SessionError::EndedEarly { error, .. } | SessionError::EndedEarlyUnwritten { error, .. } => error.as_ref(),
+        _ => return false,
+    };
+    match error {
+        PipelineError::Checkpoint(error) => of_no_use(error),
+        error => matches!(error, PipelineError::NotRepeated { .. }),
     }
 }
 
@@ -223,7 +241,7 @@ fn write_cell(session: &Session, replay: Replay, folder: &Path) -> Result<(), Se
         wall_s: result.wall_s,
     };
     let text = serde_json::to_string(&row).expect("a row is numbers");
-    Ok(keysplat::files::write_atomically(&folder.join(CellRow::FILE), text.as_bytes()).map_err(OutputError::from)?)
+    Ok(keysplat::files::write_durably(&folder.join(CellRow::FILE), text.as_bytes()).map_err(OutputError::from)?)
 }
 
 /// The result of a cell that was refined.

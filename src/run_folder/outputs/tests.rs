@@ -28,25 +28,12 @@ fn a_folder_is_made_and_locked() {
     assert_eq!(names(&out), [".lock", "views"]);
     drop(lock);
     std::fs::write(out.join(".map.ply.123.partial"), b"half").unwrap();
+    std::fs::write(out.join("views/.000123.png.123.partial"), b"half").unwrap();
     drop(prepare_folder(&out).unwrap());
     assert_eq!(names(&out), [".lock", "views"]);
+    assert!(names(&out.join(VIEWS)).is_empty());
     std::fs::write(parent.path().join("file"), b"").unwrap();
     assert!(matches!(prepare_folder(&parent.path().join("file")), Err(OutputError::Folder { .. })));
-}
-
-#[test]
-fn the_map_is_found_by_its_format() {
-    let folder = tempfile::tempdir().unwrap();
-    assert_eq!(find_map(folder.path()), None);
-    for &format in MapFormat::all() {
-        let path = folder.path().join(format!("map.{}", format.extension()));
-        std::fs::write(&path, b"").unwrap();
-        // Formats of one extension are read alike.
-        let first = MapFormat::of_path(&path).unwrap();
-        assert_eq!(first.extension(), format.extension());
-        assert_eq!(find_map(folder.path()), Some((path.clone(), first)));
-        std::fs::remove_file(path).unwrap();
-    }
 }
 
 #[test]

@@ -27,6 +27,7 @@ pub(super) const LAYOUT: LayoutRow = LayoutRow {
     marker: "mav0/cam0",
     help: "`mav0/cam0` and optionally `mav0/cam1`, each with `data.csv`, `sensor.yaml` and `data`.",
     is_photos: false,
+    takes_camera: false,
     recognise,
     open: |folder, _| open(folder),
     parse: |bytes| {

@@ -43,6 +43,15 @@ pub(super) struct CameraFile {
     pub stereo: Option<StereoTable>,
 }
 
+impl CameraFile {
+    /// A known camera, as a file would describe it.
+    fn of(camera: Camera) -> (Camera, Self) {
+        let depth_units_per_metre = Some(camera.depth_units_per_metre);
+        let (pinhole, distortion) = (camera.pinhole, camera.distortion);
+        (camera, Self { pinhole, distortion, depth_units_per_metre, fps: usual_fps(), stereo: None })
+    }
+}
+
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct StereoTable {
@@ -59,6 +68,7 @@ pub(super) const LAYOUT: LayoutRow = LayoutRow {
     marker: "camera.toml",
     help: "`camera.toml` and images in the folder itself, in `rgb` and optionally `depth`, or in `left` and `right`.",
     is_photos: false,
+    takes_camera: true,
     recognise,
     open,
     parse: |bytes| parse_text(bytes, |text, path| vec![parse_camera(text, path).map(drop)]),
@@ -78,7 +88,10 @@ fn open(folder: &Path, named: Option<&str>) -> Result<Sequence, SequenceError> {
     }
     let path = named.filter(|name| cameras::is_file(name)).map_or_else(|| folder.join(FILE), PathBuf::from);
     let content = |what: &str| SequenceError::Content { path: path.clone(), what: what.into() };
-    let (camera, file) = parse_camera(&read_text(&path)?, &path)?;
+    let (camera, file) = match named {
+        Some(preset) if !cameras::is_file(preset) => CameraFile::of(cameras::by_name(preset)?),
+        _ => parse_camera(&read_text(&path)?, &path)?,
+    };
     let (color_folder, other_folder, sensor) = match file.stereo {
         Some(StereoTable { baseline_metres }) => {
             if !(baseline_metres.is_finite() && baseline_metres > 0.0) {
@@ -232,5 +245,10 @@ mod tests {
             std::fs::rename(right.join(format!("{name}.png")), right.join(format!("r{name}.png"))).unwrap();
         }
         assert!(open(&strangers).unwrap_err().contains("no image here has the name of one in"));
+        let folder = recording(PINHOLE, &["."]);
+        for (camera, part) in [("nosuch", "no camera is called `nosuch`"), ("tum-fr1", "the camera is 640x480")] {
+            let message = Sequence::open(folder.path(), None, Some(camera)).unwrap_err().to_string();
+            assert!(message.contains(part), "{message}");
+        }
     }
 }

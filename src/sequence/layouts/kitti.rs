@@ -21,6 +21,7 @@ pub(super) const LAYOUT: LayoutRow = LayoutRow {
     marker: "calib.txt and image_0",
     help: "`image_0` and `image_1` (or `image_2` and `image_3`), `calib.txt`, optionally `times.txt` and `poses.txt`.",
     is_photos: false,
+    takes_camera: false,
     recognise,
     open: |folder, _| open(folder),
     parse: |bytes| {

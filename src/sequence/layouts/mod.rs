@@ -72,7 +72,10 @@ impl Layout {
     }
 
     pub(super) fn open(self, path: &Path, camera: Option<&str>) -> Result<Sequence, SequenceError> {
-        (self.0.open)(path, camera)
+        match camera {
+            Some(_) if !self.0.takes_camera => Err(SequenceError::OwnCamera { folder: path.into(), layout: self.name() }),
+            camera => (self.0.open)(path, camera),
+        }
     }
 
     /// The layout whose marker files are in `folder`.

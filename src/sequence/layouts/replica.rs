@@ -20,6 +20,7 @@ pub(super) const LAYOUT: LayoutRow = LayoutRow {
     marker: "traj.txt and results",
     help: "`results/frame*.jpg` and `results/depth*.png`, `traj.txt`, and `cam_params.json` there or one folder up.",
     is_photos: false,
+    takes_camera: false,
     recognise,
     open: |folder, _| open(folder),
     parse: |bytes| {

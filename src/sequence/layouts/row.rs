@@ -21,9 +21,11 @@ pub struct LayoutRow {
     pub help: &'static str,
     /// Whether its frames are photos with known poses, each a keyframe, instead of frames of a moving camera.
     pub is_photos: bool,
+    /// Whether a camera may be named; else a recording has its own.
+    pub takes_camera: bool,
     /// Whether a folder has the marker files.
     pub recognise: fn(&Path) -> bool,
-    /// Opens a folder, or a video; takes the name of a camera preset, where the layout uses one.
+    /// Opens a folder, or a video, with the camera of a name, where the layout takes one.
     pub open: fn(&Path, Option<&str>) -> Result<Sequence, SequenceError>,
     /// Parses bytes as each kind of file of the layout, for the fuzz target. Images are left to their decoders.
     pub parse: fn(&[u8]) -> Parsed,

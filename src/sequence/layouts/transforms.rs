@@ -41,6 +41,7 @@ pub(super) const LAYOUT: LayoutRow = LayoutRow {
     marker: "transforms.json",
     help: "`transforms.json` of NeRF, instant-ngp and nerfstudio: photos with known poses.",
     is_photos: true,
+    takes_camera: false,
     recognise,
     open: |folder, _| open(folder),
     parse: |bytes| {

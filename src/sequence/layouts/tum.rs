@@ -29,6 +29,7 @@ pub(super) const LAYOUT: LayoutRow = LayoutRow {
     marker: "rgb.txt",
     help: "`rgb.txt`, `depth.txt`, `groundtruth.txt`, and `camera.txt` or a folder name that names a TUM camera.",
     is_photos: false,
+    takes_camera: true,
     recognise: |folder| folder.join("rgb.txt").is_file(),
     open,
     parse: |bytes| parse_text(bytes, |text, path| vec![parse_list(text, path).map(drop), parse_camera(text, path).map(drop)]),

@@ -12,7 +12,7 @@ use crate::tracking::features::projection::{Projection, ProjectionSearch};
 use crate::tracking::localisation::pnp::{pose_from_view, similar_keyframes};
 use crate::tracking::map::sparse_map::Map;
 use crate::tracking::rig::Rig;
-use crate::tracking::solvers::pose::{PoseObservation, PosePrior, optimise_pose};
+use crate::tracking::solvers::pose::{PoseObservation, PosePrior, median_squared, optimise_pose};
 use crate::tracking::solvers::residual::InlierClass;
 
 /// Search radius around last frame's points, pixels at the finest level, widened in turn until enough are found.
@@ -230,7 +230,7 @@ impl Context<'_> {
             landmarks,
             inliers: estimate.inliers,
             matches: usable.len(),
-            median_squared: estimate.median_squared,
+            median_squared: median_squared(&self.rig.pinhole, &estimate.camera_from_world, &observations),
             rough: false,
             prior,
         }

@@ -49,8 +49,6 @@ pub struct PoseEstimate {
     /// One per observation, in their order.
     pub classes: Vec<InlierClass>,
     pub inliers: usize,
-    /// Median of the squared pixel residuals of all observations in front of the camera, whitened; 0 without a solution.
-    pub median_squared: f64,
 }
 
 /// The pose that explains the observations best, from `initial` (camera_from_world). Without enough to go by, `initial` comes back
@@ -72,7 +70,6 @@ pub fn optimise_pose(
                 camera_from_world: *initial,
                 classes: vec![InlierClass::Outlier; observations.len()],
                 inliers: 0,
-                median_squared: 0.0,
             };
         }
         let converged = if round + 1 == ROUNDS { CONVERGED } else { NEARLY_CONVERGED };
@@ -83,10 +80,11 @@ pub fn optimise_pose(
         }
     }
     let inliers = classes.iter().filter(|t| **t != InlierClass::Outlier).count();
-    PoseEstimate { camera_from_world: pose, classes, inliers, median_squared: median_squared(pinhole, &pose, observations) }
+    PoseEstimate { camera_from_world: pose, classes, inliers }
 }
 
-fn median_squared(pinhole: &Pinhole, pose: &Se3, observations: &[PoseObservation]) -> f64 {
+/// Median of the squared pixel residuals, whitened, of all observations in front of the camera; 0 without any.
+pub fn median_squared(pinhole: &Pinhole, pose: &Se3, observations: &[PoseObservation]) -> f64 {
     let residual = |o: &PoseObservation| o.measurement.residual(pinhole, &(pose * o.point_in_world).coords);
     let mut squared: Vec<f64> = observations.iter().filter_map(residual).map(|r| r.xy().norm_squared()).collect();
     let middle = squared.len() / 2;

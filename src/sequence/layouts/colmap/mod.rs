@@ -68,6 +68,7 @@ pub(super) const LAYOUT: LayoutRow = LayoutRow {
     marker: "images and sparse/0",
     help: "`images` and COLMAP's model of them in `sparse/0`, binary or text: photos with known poses.",
     is_photos: true,
+    takes_camera: false,
     recognise,
     open: |folder, _| open(folder),
     parse,

@@ -38,6 +38,7 @@ pub(super) const LAYOUT: LayoutRow = LayoutRow {
     marker: "camera.toml and a video",
     help: "A video file with its `camera.toml` beside it, or a folder with these two alone.",
     is_photos: false,
+    takes_camera: true,
     recognise,
     open,
     parse: |bytes| {
