@@ -63,7 +63,10 @@ impl Mapper {
         let members = |chunk: &ChunkId| self.chunks.get(*chunk, self.config.sh_degree, self.cloud.rounds());
         let members = coming.iter().map(members).collect::<Result<Vec<Members>, _>>()?;
         self.cloud.limit(self.most_gaussians());
-        self.cloud.put_back(&self.gpu, &CloudPart::joined(members.iter().map(|members| &members.part)))?;
+        let mut part = CloudPart::joined(members.iter().map(|members| &members.part));
+        // Where they were fixed, it was for what was near them then.
+        part.release();
+        self.cloud.put_back(&self.gpu, &part)?;
         for (chunk, members) in coming.into_iter().zip(members) {
             self.anchors.put_back(&members.keyframes);
             self.chunks.is_back(chunk);

@@ -144,6 +144,10 @@ impl Mapper {
         let mut steps = Vec::with_capacity(count);
         while steps.len() < count {
             if self.epoch.is_empty() {
+                if self.is_staying() && !steps.is_empty() {
+                    // Their Gaussians may leave for the next stay.
+                    break;
+                }
                 self.epoch = self.next_epoch(left.saturating_sub(steps.len()))?;
             }
             let Some(keyframe) = self.epoch.pop() else { break };
@@ -157,13 +161,18 @@ impl Mapper {
 
     /// Keyframes in the order in which steps learn from them, the last first.
     fn next_epoch(&mut self, left: usize) -> Result<Vec<usize>, MappingError> {
-        if self.turns.have_begun() && !self.chunks.are_here() {
+        if self.is_staying() {
             return self.next_stay(left);
         }
         self.turns.end_stay();
         let mut epoch = self.learnable(self.views());
         self.rng.shuffle(&mut epoch);
         Ok(epoch)
+    }
+
+    /// Whether epochs are stays with what the GPU has room for.
+    fn is_staying(&self) -> bool {
+        self.turns.have_begun() && !self.chunks.are_here()
     }
 
     /// Share of the steps that Gaussians on the GPU have had, as rates and density control take it.

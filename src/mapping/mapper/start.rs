@@ -15,13 +15,14 @@ const MOST_HARMONIC: f32 = 16.0;
 const MOST_COORDINATE: f32 = 1e5;
 
 impl Mapper {
-    /// Takes in points of the scene that are known before any keyframe, in the keyframes' world; `anchor` is the first of these.
+    /// Takes in points of the scene that are known before any keyframe, as many as the limits allow, in the keyframes' world; `anchor` is the first of these.
     ///
     /// # Errors
     /// [`MappingError`] if a buffer does not fit or the device fails.
     pub fn add_points(&mut self, known: &[KnownPoint], anchor: KeyframeId) -> Result<(), MappingError> {
         let new = initialise_from_points::gaussians(known, &self.config.points, self.config.sh_degree);
-        self.begin_with(new, anchor)
+        let room = self.most_gaussians().saturating_sub(self.cloud.len());
+        self.begin_with(if new.len() > room { new.thinned(room) } else { new }, anchor)
     }
 
     /// Takes in a map that is known before any keyframe, in the keyframes' world; `anchor` is the first of these. Its harmonics are those of

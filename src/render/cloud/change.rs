@@ -158,15 +158,16 @@ impl GpuCloud {
         let (sh_degree, resized) = (self.sh_degree, capacity != self.capacity);
         let Self { parameters, moments_1, moments_2, averages, histories, spare, spare_histories, kernels, uniforms, .. } = self;
         let by = (&*kernels, &*uniforms);
+        // The histories first: they are one plane, and a failure here or below leaves the averages as they were, which are what a map is read from.
+        let to = spare_histories.take().filter(|_| !resized).map_or_else(|| allocate_histories(gpu, capacity), Ok)?;
+        gathering.gather(gpu, by, histories, &to);
+        *spare_histories = Some(std::mem::replace(histories, to));
         for buffer in [&mut *parameters, moments_1, moments_2, &mut *averages] {
             // An old one of another size is given back before the new one is made.
             let to = spare.take().filter(|_| !resized).map_or_else(|| allocate(gpu, sh_degree, capacity), Ok)?;
             gathering.gather(gpu, by, buffer, &to);
             *spare = Some(std::mem::replace(buffer, to));
         }
-        let to = spare_histories.take().filter(|_| !resized).map_or_else(|| allocate_histories(gpu, capacity), Ok)?;
-        gathering.gather(gpu, by, histories, &to);
-        *spare_histories = Some(std::mem::replace(histories, to));
         let Gathering { changes, kept, children, of_children, .. } = gathering;
         if children > 0 {
             let bindings = [(0, uniforms.of(of_children)), (1, &changes), (2, &*parameters), (3, &*averages), (4, &*histories)];

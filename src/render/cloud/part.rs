@@ -14,6 +14,7 @@ use crate::splat::{GaussianCloud, ShDegree};
 
 /// Places among the buffers.
 const PARAMETERS: usize = 0;
+const MOMENTS_2: usize = 2;
 const AVERAGES: usize = 3;
 
 /// Gaussians with their moments, averages and histories.
@@ -120,6 +121,13 @@ impl CloudPart {
                 which.iter().zip(moved).for_each(|(i, value)| plane[*i] = value);
             }
         }
+    }
+
+    /// Steps may move its Gaussians, whichever were fixed (see [`GpuCloud::fix`]) when they were copied out.
+    pub fn release(&mut self) {
+        let count = self.len();
+        let planes = self.values.len() / (BUFFERS * count).max(1);
+        self.values[(MOMENTS_2 * planes + 1) * count..][..count].iter_mut().for_each(|value| value[3] = 0.0);
     }
 
     /// Its Gaussians are younger by so many rounds of density control: those in which they were away.

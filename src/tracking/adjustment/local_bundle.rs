@@ -19,8 +19,6 @@ use crate::tracking::solvers::residual::InlierClass;
 const MIN_SHARED: usize = 15;
 /// Keyframes that hold the window in place, at most; bounds the time.
 const MAX_FIXED: usize = 40;
-/// Observations of one adjustment: bounds the time of making it and of taking it in.
-const MOST_OBSERVATIONS: usize = 100_000;
 
 /// A part of the map to be adjusted: the problem, and what its numbers mean.
 #[derive(Clone, Debug, Default)]
@@ -46,13 +44,14 @@ impl Adjustment {
         Self::new(map, &free, &fixed, rig)
     }
 
-    /// Global bundle adjustment of the submap that begins with `root`; `None` if it is too large for one adjustment. Few landmarks would tear a
+    /// Global bundle adjustment of the submap that begins with `root`; `None` if it has more observations than that. Few landmarks would tear a
     /// keyframe from where all pixels put it: such a keyframe is carried.
-    pub fn of_all(map: &Map, root: usize, rig: &Rig) -> Option<Self> {
+    pub fn of_all(map: &Map, root: usize, most_observations: usize, rig: &Rig) -> Option<Self> {
         let mut observations = 0;
         for keyframe in map.living_in(root) {
-            observations += map.keyframes[keyframe].landmarks.iter().flatten().count();
-            if observations > MOST_OBSERVATIONS {
+            let landmarks = map.keyframes[keyframe].landmarks.iter().flatten();
+            observations += landmarks.filter(|l| map.landmarks[**l].observations.len() > 1).count();
+            if observations > most_observations {
                 return None;
             }
         }
@@ -112,7 +111,11 @@ impl Adjustment {
             map.set_pose(*k, *pose);
         }
         for other in self.carried.iter().copied().chain(self.known..map.keyframes.len()) {
-            let Some((neighbour, _)) = map.covisible(other).into_iter().find(|(k, _)| before.contains_key(k)) else { continue };
+            let covisible = map.covisible(other).into_iter().map(|(k, _)| k).find(|k| before.contains_key(k));
+            // Pixels tie a keyframe that shares no landmarks to the one before it.
+            let preceding = || before.range(..other).next_back().map(|(k, _)| *k);
+            let in_submap = |k: &usize| map.keyframes[*k].root == map.keyframes[other].root;
+            let Some(neighbour) = covisible.or_else(preceding).filter(in_submap) else { continue };
             let pose = map.keyframes[other].camera_from_world;
             let other_from_neighbour = pose * before[&neighbour].inverse();
             before.insert(other, pose);

@@ -9,8 +9,12 @@ use crate::tracking::solvers::residual::Measurement;
 
 /// Side of the search grid's cells, pixels.
 const CELL_PIXELS: f64 = 16.0;
-/// Relative standard deviation of depth up to which a measurement makes a point.
-const MAX_DEPTH_ERROR: f64 = 0.08;
+/// Relative standard deviation of depth up to which a measurement makes a point, as the weights have it: about three times the real one.
+const CERTAIN_DEPTH: f64 = 0.24;
+/// So many features of a frame make points, the most certain ones,
+const FEWEST_POINTS: usize = 100;
+/// up to this deviation.
+const MAX_DEPTH_ERROR: f64 = 0.5;
 
 /// One feature of a frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -36,6 +40,18 @@ pub struct FrameFeatures {
     cells: Vec<u32>,
     /// Pixels and indices: a search reads them in a row.
     by_cell: Vec<(Vector2<f64>, u32)>,
+    /// Relative standard deviation of depth up to which a measurement makes a point.
+    max_depth_error: f64,
+}
+
+/// The error up to which a feature's depth makes a point: larger where fewer than [`FEWEST_POINTS`] are certain.
+fn max_depth_error(features: &[Feature]) -> f64 {
+    let mut errors: Vec<f64> = features.iter().filter_map(|f| Some(f.inverse_depth_sigma * f.depth_metres?)).collect();
+    if errors.len() > FEWEST_POINTS {
+        errors.select_nth_unstable_by(FEWEST_POINTS - 1, f64::total_cmp);
+        errors.truncate(FEWEST_POINTS);
+    }
+    errors.into_iter().fold(CERTAIN_DEPTH, f64::max).min(MAX_DEPTH_ERROR)
 }
 
 impl FrameFeatures {
@@ -56,7 +72,8 @@ impl FrameFeatures {
         for c in 1..cells.len() {
             cells[c] += cells[c - 1];
         }
-        Self { features, columns, rows, cells, by_cell }
+        let max_depth_error = max_depth_error(&features);
+        Self { features, columns, rows, cells, by_cell, max_depth_error }
     }
 
     pub fn len(&self) -> usize {
@@ -81,7 +98,7 @@ impl FrameFeatures {
     pub fn point_in_camera(&self, index: usize, rig: &Rig) -> Option<Point3<f64>> {
         let feature = &self.features[index];
         let inverse_depth = rig.measurement(feature).inverse_depth?;
-        let certain = inverse_depth * MAX_DEPTH_ERROR > feature.inverse_depth_sigma;
+        let certain = inverse_depth * self.max_depth_error > feature.inverse_depth_sigma;
         certain.then(|| Point3::from(rig.pinhole.unproject(&feature.pixel, 1.0 / inverse_depth)))
     }
 
@@ -113,6 +130,7 @@ fn cell(coordinate: f64, count: usize) -> usize {
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
+    use crate::tracking::TrackingConfig;
     use crate::tracking::solvers::residual::tests::PINHOLE;
 
     pub fn feature(x: f64, y: f64, descriptor: Descriptor) -> Feature {
@@ -134,5 +152,23 @@ pub(crate) mod tests {
             let expected: Vec<usize> = (0..800).filter(|i| (list[*i].pixel - centre).norm() <= radius).collect();
             assert_eq!(found, expected);
         }
+    }
+
+    #[test]
+    fn certain_depth_makes_points_and_else_the_most_certain() {
+        let rig = Rig::new(PINHOLE, TrackingConfig::default());
+        let points = |metres: &dyn Fn(usize) -> f64| {
+            let at = |i| Feature {
+                depth_metres: Some(metres(i)),
+                inverse_depth_sigma: 0.025,
+                ..feature(9.0, 9.0, Descriptor::default())
+            };
+            let features = FrameFeatures::new((0..300).map(at).collect(), &PINHOLE);
+            (0..300).filter(|i| features.point_in_camera(*i, &rig).is_some()).count()
+        };
+        assert_eq!(points(&|_| 9.0), 300);
+        assert_eq!(points(&|i| if i % 2 == 0 { 9.0 } else { 10.0 }), 150);
+        assert_eq!(points(&|i| 10.0 + 0.01 * i as f64), FEWEST_POINTS - 1);
+        assert_eq!(points(&|_| 30.0), 0);
     }
 }

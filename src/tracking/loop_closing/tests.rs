@@ -110,7 +110,7 @@ fn a_loop_is_closed_with_and_without_scale() {
         assert!(before > 0.1 && map.covisible(newest).iter().all(|(k, _)| *k > 20), "{before} m");
         let mut again = map.clone();
         let moved = close(&mut LoopCloser::default(), &mut map, newest, &config);
-        let mut all = Adjustment::of_all(&map, 0, &Rig::new(PINHOLE, config.clone())).unwrap();
+        let mut all = Adjustment::of_all(&map, 0, usize::MAX, &Rig::new(PINHOLE, config.clone())).unwrap();
         all.solve(&PINHOLE, config.bundle_iterations);
         all.apply(&mut map, &config);
         assert_eq!(moved.iter().map(|m| m.keyframe).collect::<Vec<_>>(), (1..=newest).collect::<Vec<_>>());

@@ -10,7 +10,7 @@ use crate::tracking::rig::Rig;
 use crate::tracking::solvers::residual::InlierClass;
 
 /// Keyframes with which landmarks are joined: those sharing most landmarks. What lies near but shares none is a matter for
-/// `loop_closing.rs`, which spreads the drift between the two instead of bending one over to the other.
+/// `loop_closing`, which spreads the drift between the two instead of bending one over to the other.
 const FUSED_COVISIBLE: usize = 10;
 /// Search radius when joining, pixels at the finest level.
 const FUSE_RADIUS: f64 = 3.0;

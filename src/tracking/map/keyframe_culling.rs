@@ -69,7 +69,8 @@ pub fn thin(map: &mut Map, bytes: u64, from: usize, keep: impl Fn(usize) -> bool
             all += 1;
             elsewhere += usize::from(map.landmarks[*landmark].observations.len() > 1);
         }
-        f64::from(elsewhere as u32) / f64::from(all.max(1))
+        // Without landmarks, nothing is lost with it.
+        if all == 0 { 1.0 } else { f64::from(elsewhere as u32) / f64::from(all) }
     };
     let shares: Vec<(usize, f64)> = examined.iter().map(|k| (*k, seen_elsewhere(k))).collect();
     let most = shares.iter().max_by(|a, b| a.1.total_cmp(&b.1).then(b.0.cmp(&a.0)));
@@ -79,9 +80,12 @@ pub fn thin(map: &mut Map, bytes: u64, from: usize, keep: impl Fn(usize) -> bool
     examined.last().copied().unwrap_or(0)
 }
 
-/// Culls a keyframe; `false` if no other could be its parent.
+/// Culls a keyframe; `false` if no other could be its parent. Pixels tie one that shares no landmarks to the one before it.
 fn cull(map: &mut Map, keyframe: usize, config: &TrackingConfig) -> bool {
-    let Some((parent, _)) = map.covisible(keyframe).first().copied() else { return false };
+    let covisible = map.covisible(keyframe).first().map(|(other, _)| *other);
+    let root = map.keyframes[keyframe].root;
+    let preceding = || map.living.range(..keyframe).next_back().copied().filter(|other| map.keyframes[*other].root == root);
+    let Some(parent) = covisible.or_else(preceding) else { return false };
     for (feature, landmark) in map.keyframes[keyframe].landmarks.clone().into_iter().enumerate() {
         let Some(landmark) = landmark else { continue };
         map.remove_observation(landmark, Observation { keyframe, feature });

@@ -22,8 +22,10 @@ use crate::tracking::map::trim;
 
 /// Links that a keyframe keeps.
 const MOST_LINKS: usize = 5;
-/// Keyframes after the end of a landmark until its place is used again.
-const REUSED_AFTER: usize = 2;
+/// Keyframes after a frame's reference until the frame's pose is solved again.
+pub const SETTLED_AFTER: usize = 12;
+/// Keyframes after the end of a landmark until its place is used again: later than the frames that saw it are solved again.
+const REUSED_AFTER: usize = SETTLED_AFTER + 4;
 /// Host memory of a keyframe's feature: itself, its place in the grid, the landmark that it shows, the observation, its entry in the database.
 const BYTES_PER_FEATURE: usize = size_of::<Feature>() + 24 + size_of::<Option<usize>>() + 2 * size_of::<Observation>() + 48;
 const BYTES_PER_LANDMARK: usize = size_of::<Landmark>();
@@ -229,6 +231,11 @@ impl Map {
                 LandmarkState::MergedInto(next) => id = next,
             }
         }
+    }
+
+    /// The living landmark that has become of the one that went by this id when there were `known` keyframes, if any.
+    pub fn resolve_since(&self, landmark: usize, known: usize) -> Option<usize> {
+        if self.landmarks[landmark].first_keyframe < known { self.resolve(landmark) } else { None }
     }
 
     /// Keyframes that see the given landmarks and how many of them, most first, then newest first.

@@ -1,13 +1,13 @@
 //! New landmarks from two views: features that show no landmark yet are matched along epipolar lines and triangulated
 //! (Mur-Artal, Montiel & Tardós, *ORB-SLAM*, IEEE T-RO 2015, sec. VI-C). For cameras without depth, and for what depth does not reach.
 
-use nalgebra::{Matrix3, Point3, Vector2, Vector3};
+use nalgebra::{Point3, Vector2, Vector3};
 
-use crate::geometry::se3::skew;
 use crate::geometry::{Pinhole, Se3};
 use crate::tracking::features::frame_features::Feature;
 use crate::tracking::map::sparse_map::{Keyframe, Map, Observation};
 use crate::tracking::rig::Rig;
+use crate::tracking::solvers::epipolar::fundamental;
 use crate::tracking::solvers::residual::InlierClass;
 
 /// Keyframes that a new one is matched with.
@@ -126,11 +126,11 @@ pub fn triangulate_with_neighbours(map: &mut Map, keyframe: usize, rig: &Rig) ->
 /// Pairs of the wanted features that show one point; each feature at most once.
 pub fn match_along_lines(this: &Candidates<'_>, other: &Candidates<'_>, rig: &Rig) -> Vec<MatchedPoint> {
     let pinhole = &rig.pinhole;
-    let fundamental = fundamental(&(other.camera_from_world * this.camera_from_world.inverse()), pinhole);
+    let line_of = fundamental(&(other.camera_from_world * this.camera_from_world.inverse()), pinhole);
     let mut taken: Vec<Option<(u32, MatchedPoint)>> = vec![None; other.features.len()];
     for &mine in &this.wanted {
         let feature = &this.features[mine];
-        let line = fundamental * feature.pixel.push(1.0);
+        let line = line_of * feature.pixel.push(1.0);
         let Some((theirs, distance)) = best_on_line(feature, &line, other, rig) else { continue };
         let found = &other.features[theirs];
         let Some(met) = triangulate(&this.view(pinhole), &feature.pixel, &other.view(pinhole), &found.pixel) else { continue };
@@ -185,22 +185,6 @@ fn agree(point: &Point3<f64>, a: &Observed<'_>, b: &Observed<'_>, rig: &Rig) -> 
     let size = |Observed { feature, view }: &Observed<'_>| (point - view.centre()).norm() / rig.octave_scale(feature.octave);
     let ratio = size(a) / size(b);
     projects(a) && projects(b) && ratio < SIZE_SLACK && ratio > 1.0 / SIZE_SLACK
-}
-
-/// F with `b·F·a = 0` for pixels `a` and `b` of one point, from `b_from_a`.
-pub fn fundamental(b_from_a: &Se3, pinhole: &Pinhole) -> Matrix3<f64> {
-    let inverse = Matrix3::new(
-        1.0 / pinhole.fx,
-        0.0,
-        -pinhole.cx / pinhole.fx,
-        0.0,
-        1.0 / pinhole.fy,
-        -pinhole.cy / pinhole.fy,
-        0.0,
-        0.0,
-        1.0,
-    );
-    inverse.transpose() * skew(&b_from_a.translation.vector) * b_from_a.rotation.to_rotation_matrix().matrix() * inverse
 }
 
 #[cfg(test)]

@@ -2,7 +2,7 @@
 //! (Triggs et al., *Bundle adjustment: a modern synthesis*, 2000), Huber's kernel, and depth residuals. The bias of measured depth is one more block
 //! of unknowns beside the free poses.
 //!
-//! Knows nothing of the map; `window.rs` makes the problem and takes the result. Sums run in the order of the observations.
+//! Knows nothing of the map; `adjustment/local_bundle.rs` makes the problem and takes the result. Sums run in the order of the observations.
 
 use nalgebra::{Matrix3, Matrix6, Matrix6x3, Point3, Vector3, Vector6};
 

@@ -22,6 +22,9 @@ use crate::tracking::{KeyframeUpdate, StageTimes, TrackingError};
 /// adjusted: without depth it is always the next frame.
 const TAKEN_IN_AFTER: usize = 3;
 const TAKEN_IN_SHARE: usize = 4;
+/// Observations up to which the whole submap is adjusted at the end, when no frame waits, and what each takes of host memory.
+const MOST_AT_THE_END: usize = 2_000_000;
+const BYTES_PER_OBSERVATION: u64 = 450;
 
 /// The worker, and what it is at.
 #[derive(Debug)]
@@ -109,7 +112,8 @@ impl Tracker {
         if std::mem::replace(&mut self.adjusting.all_adjusted_at, self.frames_seen) == self.frames_seen {
             return;
         }
-        let all = Adjustment::of_all(&self.map, self.largest_submap(), &self.rig);
+        let most = MOST_AT_THE_END.min((self.rig.config.max_host_bytes / BYTES_PER_OBSERVATION) as usize);
+        let all = Adjustment::of_all(&self.map, self.largest_submap(), most, &self.rig);
         let Some(mut all) = all.map(|all| self.with_bias(all)) else { return };
         all.solve(&self.rig.pinhole, self.rig.config.bundle_iterations);
         self.rig.depth_bias = all.bias().unwrap_or(self.rig.depth_bias);
@@ -165,7 +169,10 @@ impl Tracker {
         self.adjusting.under_way = None;
         if !solved.fits(&self.map) {
             // A correction came between: once more, unless a newer keyframe's window is next.
-            self.adjusting.waiting.get_or_insert(Waiting { keyframe: under_way.around, held: true });
+            match self.adjusting.waiting {
+                Some(_) => self.adjusting.overtaken.push(under_way.around),
+                None => self.adjusting.waiting = Some(Waiting { keyframe: under_way.around, held: true }),
+            }
             return self.begin_next(times);
         }
         solved.apply(&mut self.map, &self.rig.config).into_iter().for_each(|k| self.note_move(k, 1.0));
@@ -222,10 +229,10 @@ impl Tracker {
     /// Runs after a keyframe's local bundle adjustment: a loop may be found, at it or at keyframes that it has overtaken, or some keyframes may
     /// have become redundant.
     fn close_loops_and_cull(&mut self, keyframe: usize, times: &mut StageTimes) {
-        self.refresh_links(keyframe);
         let mut closed = false;
         let mut keyframes = std::mem::take(&mut self.adjusting.overtaken);
         keyframes.push(keyframe);
+        keyframes.iter().for_each(|keyframe| self.refresh_links(*keyframe));
         for keyframe in &keyframes {
             closed = closed || self.look_for_loop(*keyframe, times);
         }
@@ -242,7 +249,7 @@ impl Tracker {
         times.mapping_ms += milliseconds(clock);
     }
 
-    /// Bundle adjustment has changed what a keyframe and its neighbours share.
+    /// Bundle adjustment and joined landmarks have changed what a keyframe and its neighbours share.
     fn refresh_links(&mut self, keyframe: usize) {
         self.map.refresh_links(keyframe);
         let neighbours: Vec<usize> = self.map.keyframes[keyframe].links.iter().map(|(k, _)| *k).collect();

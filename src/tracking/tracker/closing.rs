@@ -17,6 +17,8 @@ use crate::tracking::{StageTimes, TrackingError};
 /// Deterministic replay: keyframes of a correction, and observations of an adjustment, that the thread has to itself a frame for.
 const KEYFRAMES_A_FRAME: usize = 8;
 const OBSERVATIONS_A_FRAME: usize = 500;
+/// Observations up to which a loop is followed by one adjustment of its whole submap: bounds the time of making it and of taking it in.
+const MOST_AT_A_LOOP: usize = 100_000;
 /// Of the keyframes that a correction has moved, every so many gets a window of its own.
 const WINDOW_EVERY: usize = 4;
 
@@ -134,7 +136,7 @@ impl Tracker {
             if *keyframe == self.motion.reference
                 && let Some(velocity) = &mut self.motion.velocity
             {
-                velocity.translation.vector *= *growth;
+                velocity.motion.translation.vector *= *growth;
             }
             self.note_move(*keyframe, *growth);
         }
@@ -164,7 +166,7 @@ impl Tracker {
         }
         let first = self.closing.unsettled.front().copied()?;
         let root = self.map.keyframes[first].root;
-        if let Some(all) = Adjustment::of_all(&self.map, root, &self.rig) {
+        if let Some(all) = Adjustment::of_all(&self.map, root, MOST_AT_A_LOOP, &self.rig) {
             self.closing.unsettled.clear();
             let later = 1 + all.problem.observations.len() / OBSERVATIONS_A_FRAME;
             return Some((Job::Adjust(all, Extent::All), later));

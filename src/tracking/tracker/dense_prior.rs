@@ -23,7 +23,7 @@ impl Tracker {
             return None;
         }
         let (dense, before) = (frame.dense.as_ref()?, self.dense.last.as_ref()?);
-        let mut guesses = vec![self.motion.velocity.unwrap_or_default(), Se3::identity()];
+        let mut guesses = vec![self.expected_motion(), Se3::identity()];
         guesses.extend(guess.map(|pose| pose * last.camera_from_world.inverse()));
         let mut prior = align(before, dense, &guesses)?.prior(&last.camera_from_world);
         if let Some((keyframe, view)) = &self.dense.keyframe {

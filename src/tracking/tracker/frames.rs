@@ -10,14 +10,12 @@ use nalgebra::Vector2;
 use super::{Tracker, keyframe_selection};
 use crate::geometry::Se3;
 use crate::tracking::features::frame_features::FrameFeatures;
-use crate::tracking::map::sparse_map::{Keyframe, Map};
+use crate::tracking::map::sparse_map::{Keyframe, Map, SETTLED_AFTER};
 use crate::tracking::rig::Rig;
 use crate::tracking::solvers::pose::{PoseObservation, optimise_pose};
 use crate::tracking::solvers::residual::Measurement;
 use crate::tracking::{KeyframePose, NewKeyframe};
 
-/// Keyframes after a frame's reference until its pose is solved again.
-const SETTLED_AFTER: usize = 12;
 /// At each frame so many are, so that none takes long.
 const SETTLED_A_FRAME: usize = 2;
 /// Frames that may wait for it: a camera that stands still makes no keyframes.
@@ -86,7 +84,7 @@ impl Sightings {
     /// Those whose landmarks are still there.
     fn observations(&self, map: &Map, rig: &Rig) -> Vec<PoseObservation> {
         let observation = |s: &Sighting| {
-            let landmark = map.resolve(s.landmark as usize).filter(|landmark| map.is_alive_since(*landmark, self.known))?;
+            let landmark = map.resolve_since(s.landmark as usize, self.known)?;
             let measured = Measurement {
                 pixel: Vector2::from(s.pixel.map(f64::from)),
                 inverse_depth: (!s.inverse_depth.is_nan()).then_some(s.inverse_depth.into()),

@@ -18,8 +18,9 @@ const LEAST_MOTION: f64 = 0.25;
 const IMAGE_INTERVAL_SHARE: f64 = 0.9;
 /// if the camera has moved by this share of what a keyframe needs.
 const LEAST_IMAGE_MOTION: f64 = 0.02;
-/// Below this overlap the motion no longer matters.
+/// Below this overlap nearly any motion is enough. A camera at rest needs no keyframes, however little it sees.
 const LOW_OVERLAP: f64 = 0.25;
+const LEAST_MOTION_AT_LOW_OVERLAP: f64 = 0.05;
 
 /// Whether a tracked frame should become a keyframe; `reference` is the keyframe that shares most landmarks with it.
 pub fn is_due(map: &Map, frame: &FrameFeatures, found: &Localised, reference: usize, config: &TrackingConfig) -> bool {
@@ -37,7 +38,7 @@ pub fn is_due(map: &Map, frame: &FrameFeatures, found: &Localised, reference: us
     };
     let new_view = with_depth(true) < FEW_TRACKED && with_depth(false) > MANY_NEW;
     let changed = overlap < config.keyframe_overlap || new_view;
-    motion > 1.0 || overlap < LOW_OVERLAP || (changed && motion > LEAST_MOTION)
+    motion > 1.0 || (overlap < LOW_OVERLAP && motion > LEAST_MOTION_AT_LOW_OVERLAP) || (changed && motion > LEAST_MOTION)
 }
 
 /// Whether a frame that is no keyframe is worth an image-only one: so many seconds after the last keyframe of either kind, after so much motion, as a

@@ -18,7 +18,7 @@ impl Tracker {
         let strict = self.lostness.is_lost || self.lostness.frames_since_found < FRESHLY_FOUND_FRAMES;
         let needed = if strict { self.rig.config.min_relocalisation_inliers } else { self.rig.config.min_inliers };
         let reference = self.motion.reference;
-        let predicted = self.motion.velocity.unwrap_or_default() * last.camera_from_world;
+        let predicted = self.expected_motion() * last.camera_from_world;
         let mut context = Context { map: &mut self.map, rig: &self.rig };
         let mut found = None;
         if !self.lostness.is_lost {

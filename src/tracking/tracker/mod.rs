@@ -11,6 +11,7 @@ mod keyframe_selection;
 mod localising;
 mod start;
 mod submaps;
+mod velocity;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -21,6 +22,7 @@ use closing::Closing;
 use frames::{Frames, Record, Sightings};
 pub use keyframe_selection::is_image_due;
 use localising::FRESHLY_FOUND_FRAMES;
+use velocity::Velocity;
 
 use crate::geometry::{Camera, Se3, StampedPose};
 use crate::sequence::{Frame, Sensor};
@@ -76,8 +78,8 @@ pub struct Tracker {
 struct Motion {
     /// The last frame with a pose; `None` before the map is started.
     last: Option<LastFrame>,
-    /// camera_from_last_camera of the last two consecutive frames.
-    velocity: Option<Se3>,
+    /// That of the last two consecutive frames.
+    velocity: Option<Velocity>,
     /// Keyframe that shares most landmarks with the last frame.
     reference: usize,
 }
@@ -277,7 +279,8 @@ impl Tracker {
             self.rig.pixel_noise.observe(found.median_squared);
         }
         self.lostness.frames_since_found = if self.lostness.is_lost { 0 } else { self.lostness.frames_since_found + 1 };
-        self.motion.velocity = (!self.lostness.is_lost).then(|| found.camera_from_world * last.camera_from_world.inverse());
+        let motion = found.camera_from_world * last.camera_from_world.inverse();
+        self.motion.velocity = (!self.lostness.is_lost).then(|| Velocity { motion, interval_s: self.interval_s() });
         self.lostness.is_lost = false;
         self.lostness.frames_lost = 0;
         self.first_view = None;

@@ -14,8 +14,8 @@ impl Tracker {
     /// Starts a submap with a frame that shows enough.
     pub(super) fn start(&mut self, frame: &ExtractedFrame, may: bool, times: StageTimes) -> TrackedFrame {
         let features = frame.features.clone();
-        let with_depth = features.features.iter().filter(|f| f.depth_metres.is_some()).count();
-        if !may || with_depth < self.rig.config.min_initial_landmarks {
+        let points = (0..features.len()).filter(|i| features.point_in_camera(*i, &self.rig).is_some()).count();
+        if !may || points < self.rig.config.min_initial_landmarks {
             return TrackedFrame::lost(times);
         }
         let camera_from_world = self.next_submap().inverse();
@@ -25,7 +25,7 @@ impl Tracker {
         let landmarks = self.map.keyframes[id].landmarks.clone();
         self.record(frame, id, Se3::identity(), Sightings::default());
         let started = self.started(LastFrame { features, camera_from_world, landmarks }, id, times);
-        TrackedFrame { inliers: with_depth, ..started }
+        TrackedFrame { inliers: points, ..started }
     }
 
     /// Starts a submap with two frames that show one scene from two places.

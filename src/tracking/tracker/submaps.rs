@@ -28,6 +28,16 @@ impl Tracker {
         (intervals as usize).saturating_sub(1)
     }
 
+    /// Time between the last two frames, seconds.
+    pub(super) fn interval_s(&self) -> Option<f64> {
+        self.arrival.and_then(|(_, interval_s)| interval_s)
+    }
+
+    /// camera_from_last_camera of this frame, as the last two had it; none where they do not say.
+    pub(super) fn expected_motion(&self) -> Se3 {
+        self.motion.velocity.as_ref().map_or_else(Se3::identity, |velocity| velocity.motion_in(self.interval_s()))
+    }
+
     /// A frame without a pose: after a while it begins a new submap.
     pub(super) fn lose(
         &mut self,
