@@ -17,6 +17,7 @@ mod render;
 mod report;
 mod resume;
 mod run;
+mod signals;
 mod source;
 mod split;
 mod stress;

@@ -1,11 +1,11 @@
-//! Progress bars on standard error, and Ctrl-C.
+//! Progress bars on standard error, and an early end.
 
 use indicatif::{ProgressBar, ProgressStyle};
 use keysplat::Progress;
 use miette::IntoDiagnostic;
 
-use super::Verbosity;
 use super::keys::Keys;
+use super::{Verbosity, signals};
 
 /// A bar in the given template; hidden where nothing should be shown.
 pub fn bar(verbosity: Verbosity, len: u64, template: &str) -> ProgressBar {
@@ -24,10 +24,10 @@ pub fn spinner(verbosity: Verbosity, template: &str) -> ProgressBar {
     ProgressBar::new_spinner().with_style(ProgressStyle::with_template(template).expect("our templates are valid"))
 }
 
-/// The first Ctrl-C ends the replay and writes the results so far, the second ends the program.
-pub fn stop_on_ctrl_c(progress: &Progress) -> miette::Result<()> {
+/// The first signal ends the replay and writes the results so far, the second ends the program.
+pub fn stop_on_signals(progress: &Progress) -> miette::Result<()> {
     let progress = progress.clone();
-    ctrlc::set_handler(move || {
+    signals::on_end(move || {
         if progress.control().interrupt() {
             Keys::restore();
             std::process::exit(130);

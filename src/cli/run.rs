@@ -233,7 +233,7 @@ pub fn run(args: &RunArgs, verbosity: Verbosity) -> miette::Result<()> {
 pub fn replay(mut session: Session, view: &ViewOptions, verbosity: Verbosity) -> miette::Result<()> {
     let progress = Progress::default();
     let viewed = view.start(&session, &progress, verbosity)?;
-    progress::stop_on_ctrl_c(&progress)?;
+    progress::stop_on_signals(&progress)?;
     let frames = session.recording().sequence().entries.len() as u64;
     let refine = session.recording().config().mapping.refine.clone();
     let shown = |work: &mut dyn FnMut() -> Result<Replay, SessionError>| {

@@ -11,7 +11,7 @@ use keysplat::viewing::{DEFAULT_ADDRESS, Finished, Live, Server, ServerOptions};
 use keysplat::{Progress, Session};
 use miette::IntoDiagnostic;
 
-use super::{Verbosity, print};
+use super::{Verbosity, print, signals};
 
 /// A run that is over is served for so long after its last viewer: a page that was reloaded is back by then.
 const GONE_AFTER: Duration = Duration::from_secs(3);
@@ -48,7 +48,7 @@ pub fn view(args: &ViewArgs, verbosity: Verbosity) -> miette::Result<()> {
     let end = move || {
         let _ = send.send(());
     };
-    ctrlc::set_handler(end).into_diagnostic()?;
+    signals::on_end(end).into_diagnostic()?;
     announce(&server, !args.no_browser, verbosity)?;
     // An error means that no Ctrl-C can come any more.
     let _ = ended.recv();

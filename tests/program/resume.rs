@@ -227,7 +227,7 @@ fn a_refinement_goes_on_where_it_stood() {
 
 #[cfg(unix)]
 #[test]
-fn what_ctrl_c_ended_early_can_go_on() {
+fn what_a_signal_ended_early_can_go_on() {
     if skipped_without_adapter() {
         return;
     }
@@ -235,7 +235,7 @@ fn what_ctrl_c_ended_early_can_go_on() {
     let whole = unbroken("stopped-whole", recording(), &many);
     let out = scratch().join("stopped");
     let mut child = started(keeping(recording(), &out, &many), &out, 3);
-    assert!(Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap().success());
+    assert!(Command::new("kill").args(["-TERM", &child.id().to_string()]).status().unwrap().success());
     assert!(child.wait().unwrap().success());
     let steps = |out: &Path| metrics(out).mapping.unwrap().iterations;
     assert!(steps(&out) < steps(&whole) && checkpoint(&out).exists());
