@@ -68,9 +68,9 @@ pub const GEOMETRY_PLANES: usize = 3;
 /// Pixel of a keyframe that shows what is away: of no colour, and no alpha.
 pub const HIDDEN: u32 = 1;
 /// What stands for the gradient by a hidden pixel's depth.
-pub const HIDDEN_GRADIENT: f64 = 1e12;
+pub const HIDDEN_GRADIENT: f64 = 1e14;
 /// The gradient by a depth is below this, and that of a Gaussian that is blended into a hidden pixel above.
-pub const MOST_GRADIENT: f64 = 1e4;
+pub const MOST_GRADIENT: f64 = 1e6;
 const _: () = assert!(HIDDEN_GRADIENT * ALPHA_MIN * TRANSMITTANCE_MIN > 10.0 * MOST_GRADIENT);
 
 /// How a tile's pixels are spread over invocations. Both forms give the same result up to rounding; each is the faster one on its kind
