@@ -136,7 +136,8 @@ fn remove_pictures(out: &Path) -> Result<(), OutputError> {
     Ok(())
 }
 
-/// Writes trajectories, map, records and the resolved configuration to the disk itself: a checkpoint is of no use then. Metrics of an earlier run in the same folder are removed first: they
+/// Writes trajectories, map, records and the resolved configuration, and flushes them to the disk: the checkpoint may go then. Metrics of an
+/// earlier run in the same folder are removed first: they
 /// would belong to another map.
 ///
 /// # Errors

@@ -11,7 +11,7 @@ use crate::tracking::solvers::residual::Measurement;
 const CELL_PIXELS: f64 = 16.0;
 /// Relative standard deviation of depth up to which a measurement makes a point, as the weights have it: about three times the real one.
 const CERTAIN_DEPTH: f64 = 0.24;
-/// So many features of a frame make points, the most certain ones,
+/// So many features of a frame make points, the most certain ones, as in ORB-SLAM2,
 const FEWEST_POINTS: usize = 100;
 /// up to this deviation.
 const MAX_DEPTH_ERROR: f64 = 0.5;
