@@ -7,9 +7,10 @@ use keysplat::Gpu;
 use keysplat::evaluation::views::to_rgb8;
 use keysplat::film::{CameraPathKind, Film, poses};
 use keysplat::geometry::{Pinhole, Trajectory};
-use keysplat::render::{GpuCloud, Rasterizer};
+use keysplat::render::MapRenderer;
 use keysplat::run_folder::outputs;
 use keysplat::splat::ViewCamera;
+use keysplat::splat::model::Surface;
 use keysplat::{Config, Recording};
 use miette::{IntoDiagnostic, miette};
 
@@ -60,13 +61,12 @@ pub fn render(args: &RenderArgs, verbosity: Verbosity) -> miette::Result<()> {
         return Err(miette!("{} has no poses", args.dir.join(outputs::TRAJECTORY).display()));
     }
     let gpu = Gpu::open(args.adapter.as_deref()).into_diagnostic()?;
-    let on_gpu = GpuCloud::of(&gpu, &cloud).into_diagnostic()?;
-    let mut rasterizer = Rasterizer::new(gpu).into_diagnostic()?;
+    let mut renderer = MapRenderer::new(&gpu, &cloud, Surface::Volume, usize::MAX).into_diagnostic()?;
     let mut film = Film::create(&args.out, (pinhole.width, pinhole.height), fps).into_diagnostic()?;
     let bar = progress::bar(verbosity, poses.len() as u64, "{wide_bar} {pos}/{len} frames");
     for world_from_camera in poses {
         let camera = ViewCamera { pinhole, camera_from_world: world_from_camera.inverse() };
-        let rendered = rasterizer.render(&on_gpu, &camera, [0.0; 3]).into_diagnostic()?;
+        let rendered = renderer.render(&camera).into_diagnostic()?;
         film.append(&to_rgb8(&rendered)).into_diagnostic()?;
         bar.inc(1);
     }

@@ -1,8 +1,7 @@
 //! `keysplat run`
 
 use std::path::PathBuf;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Weak};
 use std::time::Duration;
 
 use clap::Args;
@@ -237,13 +236,15 @@ pub fn replay(mut session: Session, view: &ViewOptions, verbosity: Verbosity) ->
     let frames = session.recording().sequence().entries.len() as u64;
     let refine = session.recording().config().mapping.refine.clone();
     let shown = |work: &mut dyn FnMut() -> Result<Replay, SessionError>| {
-        let done = AtomicBool::new(false);
         std::thread::scope(|scope| {
+            // Dropped by a panic as well, so that the bar's thread always ends.
+            let running = Arc::new(());
+            let watched = Arc::downgrade(&running);
             let bar = progress::bar(verbosity, frames, "{wide_bar} {pos}/{len} frames  {msg}");
-            let (progress, refine, done) = (&progress, &refine, &done);
-            scope.spawn(move || show(progress, refine, &bar, done));
+            let (progress, refine) = (&progress, &refine);
+            scope.spawn(move || show(progress, refine, &bar, &watched));
             let replayed = work();
-            done.store(true, Ordering::Relaxed);
+            drop(running);
             replayed
         })
     };
@@ -287,11 +288,11 @@ fn print_end(finished: Result<Metrics, SessionError>, verbosity: Verbosity) -> m
     }
 }
 
-/// Keeps the bar up to date, and heeds keys, until the run is done.
-fn show(progress: &Progress, refine: &RefineConfig, bar: &ProgressBar, done: &AtomicBool) {
+/// Keeps the bar up to date, and heeds keys, while what is watched exists.
+fn show(progress: &Progress, refine: &RefineConfig, bar: &ProgressBar, watched: &Weak<()>) {
     let keys = if bar.is_hidden() { None } else { Keys::listen() };
     let mut outlook = Outlook::new(bar.length().unwrap_or(0) as usize, refine);
-    while !done.load(Ordering::Relaxed) {
+    while watched.strong_count() > 0 {
         let state = outlook.look(progress);
         bar.set_position(state.frames as u64);
         bar.set_message(state.line());

@@ -101,6 +101,12 @@ pub(super) fn insertions_allowed(inserted: usize, most: usize) -> usize {
     inserted.min((INSERTED_SHARE * most as f64) as usize)
 }
 
+/// The same before the first step, when nothing is scored: with as many of the `others` that came before gone, the `most` that stay are an even sample of all.
+pub(super) fn sampled(inserted: usize, others: usize, most: usize) -> usize {
+    let all = inserted + others;
+    if all <= most { inserted } else { (inserted as u128 * most as u128).div_ceil(all as u128) as usize }
+}
+
 /// The `excess` Gaussians to remove: the least useful, the older first among equals. Those that no view has scored yet, and that came after
 /// `scored_round`, go last. Ascending.
 pub(super) fn least_contributions(histories: &[GaussianHistory], excess: usize, scored_round: f32) -> Vec<u32> {
@@ -149,6 +155,21 @@ mod tests {
         let mut some_scored = histories;
         [0, 2, 4].into_iter().for_each(|i| some_scored[i].views = 1.0);
         assert_eq!(least_contributions(&some_scored, 2, 2.0), [0, 4]);
+    }
+
+    #[test]
+    fn places_go_to_all_insertions_alike() {
+        assert_eq!(sampled(300, 700, 1000), 300);
+        assert_eq!(sampled(300, 900, 600), 150);
+        let mut kept = vec![1000];
+        for k in 1..20 {
+            let new = sampled(1000, 1000 * k, 2000);
+            let old: usize = kept.iter().sum();
+            let share = (2000 - new).min(old) as f64 / old as f64;
+            kept.iter_mut().for_each(|count| *count = (*count as f64 * share).round() as usize);
+            kept.push(new);
+        }
+        assert!(kept.iter().all(|count| (95..=105).contains(count)), "{kept:?}");
     }
 
     #[test]

@@ -102,6 +102,8 @@ pub struct Mapper {
     epoch: Vec<usize>,
     /// Steps at the last density control.
     controlled_at: usize,
+    /// New Gaussians of all keyframes, those included that found no room.
+    inserted: usize,
     /// Whether a map of others began this one.
     has_initial_map: bool,
     /// Gaussians that the buffers of the last step had room for.
@@ -139,6 +141,7 @@ impl Mapper {
             host_times: HostTimes::default(),
             epoch: Vec::new(),
             controlled_at: 0,
+            inserted: 0,
             has_initial_map: false,
             stepped_capacity: 0,
             is_full: false,

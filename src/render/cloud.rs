@@ -186,8 +186,13 @@ impl GpuCloud {
 
     /// The most Gaussians that the adapter has room for, as far as that is known: its largest binding, and its memory once reached.
     pub fn most(&self, gpu: &Gpu) -> usize {
-        let bound = gpu.max_storage_bytes() as usize / (self.planes() * 16);
+        let bound = Self::most_bound(gpu, self.sh_degree);
         self.room.map_or(bound, |room| room.min(bound))
+    }
+
+    /// The most Gaussians that the adapter's largest binding holds.
+    pub fn most_bound(gpu: &Gpu, sh_degree: ShDegree) -> usize {
+        gpu.max_storage_bytes() as usize / (planes(sh_degree) * 16)
     }
 
     /// Before the map grows to `needed` Gaussians: reduces [`Self::most`] to what there is memory for, with `scratch_bytes` beside each and

@@ -11,7 +11,7 @@ use crate::geometry::{Pinhole, Se3, StampedPose, Trajectory};
 use crate::gpu::Gpu;
 use crate::mesh::{DepthSource, DepthView, Mesh, MeshConfig, MeshError, fuse};
 use crate::recording::{Recording, RecordingError};
-use crate::render::{GpuCloud, Rasterizer, Rendered};
+use crate::render::{MapRenderer, Rendered};
 use crate::run_folder::OutputError;
 use crate::run_folder::outputs;
 use crate::sequence::{RectifiedImage, Rectifiers, SequenceError};
@@ -113,9 +113,8 @@ pub fn mesh_folder(
     let pinhole = sensor.as_ref().map_or_else(Pinhole::assumed, |sensor| sensor.pinhole);
     let frames = frame_of_pose(recording.as_ref(), &poses);
     let gpu = Gpu::open(options.adapter.as_deref())?;
-    let on_gpu = GpuCloud::of(&gpu, &cloud)?;
     let map_depth = options.map_depth.unwrap_or_else(|| MapDepth::of(config.as_ref()));
-    let mut rasterizer = Rasterizer::of_surface(gpu, map_depth.surface())?;
+    let mut renderer = MapRenderer::new(&gpu, &cloud, map_depth.surface(), usize::MAX)?;
     let stamped: Vec<_> = poses.poses.iter().step_by(options.every.max(1)).collect();
     if stamped.is_empty() {
         return Err(missing(file, "it holds no pose; map the recording again"));
@@ -129,7 +128,7 @@ pub fn mesh_folder(
     for (done, pose) in stamped.iter().enumerate() {
         on_view(done, stamped.len());
         let camera = ViewCamera { pinhole, camera_from_world: pose.world_from_camera.inverse() };
-        let rendered = rasterizer.render(&on_gpu, &camera, [0.0; 3])?;
+        let rendered = renderer.render(&camera)?;
         let frame = frames.get(&pose.timestamp_s.to_bits());
         let image = sensor.as_mut().zip(frame).and_then(|(sensor, frame)| sensor.image(*frame));
         let depth = join(&rendered, image.as_ref(), options.depth, map_depth);

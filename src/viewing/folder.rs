@@ -21,9 +21,10 @@ use crate::geometry::Trajectory;
 use crate::gpu::{Gpu, GpuError};
 use crate::mapping::KeyframeReport;
 use crate::recording::Recording;
-use crate::render::{GpuCloud, Rasterizer, Rendered};
+use crate::render::{MapRenderer, Rendered};
 use crate::run_folder::{History, outputs};
 use crate::sequence::{RectifiedImage, SensorKind};
+use crate::splat::model::Surface;
 use crate::splat::{GaussianCloud, ViewCamera};
 
 /// Poses of a path; longer ones are thinned.
@@ -39,17 +40,12 @@ pub struct Finished {
 
 /// Answers viewers from files.
 struct FolderDesk {
-    cloud: GaussianCloud,
+    cloud: Arc<GaussianCloud>,
     recording: Option<Recording>,
     images: Option<RecordedImages>,
     keyframes: Vec<KeyframeView>,
     adapter: Option<String>,
-    renderer: Mutex<Option<Renderer>>,
-}
-
-struct Renderer {
-    rasterizer: Rasterizer,
-    cloud: GpuCloud,
+    renderer: Mutex<Option<MapRenderer<Arc<GaussianCloud>>>>,
 }
 
 impl Finished {
@@ -84,7 +80,7 @@ impl Finished {
         board.statistics.store(Arc::new(files.statistics()));
         let adapter = files.recording.as_ref().and_then(|r| r.config().adapter.clone());
         let Files { cloud, recording, .. } = files;
-        let desk = FolderDesk { cloud, recording, images, keyframes, adapter, renderer: Mutex::new(None) };
+        let desk = FolderDesk { cloud: Arc::new(cloud), recording, images, keyframes, adapter, renderer: Mutex::new(None) };
         Self { board: Arc::new(board), desk: Arc::new(desk) }
     }
 
@@ -227,10 +223,9 @@ fn json<T: DeserializeOwned>(folder: &Path, name: &str) -> Option<T> {
 }
 
 impl FolderDesk {
-    fn open_renderer(&self) -> Result<Renderer, GpuError> {
+    fn open_renderer(&self) -> Result<MapRenderer<Arc<GaussianCloud>>, GpuError> {
         let gpu = Gpu::open(self.adapter.as_deref())?;
-        let cloud = GpuCloud::of(&gpu, &self.cloud)?;
-        Ok(Renderer { rasterizer: Rasterizer::new(gpu)?, cloud })
+        MapRenderer::new(&gpu, self.cloud.clone(), Surface::Volume, usize::MAX)
     }
 }
 
@@ -247,8 +242,8 @@ impl Desk for FolderDesk {
         if renderer.is_none() {
             *renderer = Some(self.open_renderer().map_err(|error| error.to_string())?);
         }
-        let Renderer { rasterizer, cloud } = renderer.as_mut().expect("it was just opened");
-        rasterizer.render(cloud, camera, [0.0; 3]).map_err(|error| error.to_string())
+        let renderer = renderer.as_mut().expect("it was just opened");
+        renderer.render(camera).map_err(|error| error.to_string())
     }
 
     fn control(&self, _: Command) {}

@@ -4,6 +4,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use fastrand::Rng;
+use glam::{Quat, Vec3};
 use image::{Rgb, RgbImage};
 use keysplat::geometry::{Pinhole, Se3};
 use keysplat::gpu::Gpu;
@@ -11,7 +12,7 @@ use keysplat::mapping::{Keyframe, Mapper, MappingConfig, MappingError, PoseUpdat
 use keysplat::optimise::{AdamConfig, LossConfig, Pixels, TargetImage, Trainer, TrainingView};
 use keysplat::render::{BlendForm, GpuCloud, HIDDEN, MapRenderer, Plan};
 use keysplat::splat::model::Surface;
-use keysplat::splat::{GaussianCloud, ShDegree, ViewCamera};
+use keysplat::splat::{Gaussian, GaussianCloud, ShDegree, ViewCamera};
 use nalgebra::Vector3;
 
 use crate::common::requirements::adapter;
@@ -243,26 +244,67 @@ fn a_damaged_file_is_named_and_a_file_of_an_earlier_run_goes() {
     assert!(error.to_string().contains("has changed since it was written"), "{error}");
 }
 
+/// Before the first step nothing says which Gaussians are the most useful.
+#[test]
+fn a_bounded_number_before_any_step_is_an_even_sample() {
+    let Some(gpu) = adapter() else { return };
+    let mut config = MappingConfig { first_iterations: 0, iterations_per_keyframe: 0, ..config() };
+    config.refine.steps_per_keyframe = 0;
+    let whole = walk(&gpu, &config, None).gaussians();
+    config.limits.max_gaussians = Some(whole / 4);
+    let map = walk(&gpu, &config, None).download().unwrap();
+    assert!((whole / 4 - KEYFRAMES..=whole / 4).contains(&map.len()), "{} of {whole}", map.len());
+    let mut at = [0; KEYFRAMES];
+    map.means.iter().for_each(|mean| at[(mean.x / 5.0).round().clamp(0.0, (KEYFRAMES - 1) as f32) as usize] += 1);
+    let mean = map.len() / KEYFRAMES;
+    assert!(at.iter().all(|count| (mean * 3 / 4..=mean * 5 / 4).contains(count)), "{at:?}");
+}
+
 #[test]
 fn slabs_show_what_the_whole_map_shows() {
     let Some(gpu) = adapter() else { return };
     let rng = &mut Rng::with_seed(11);
     for degree in [0, 2] {
-        let map = crate::common::scene(rng, 900, ShDegree::new(degree).unwrap());
-        let pinhole = Pinhole { fx: 60.0, fy: 60.0, cx: 31.5, cy: 23.5, width: 64, height: 48 };
-        for surface in [Surface::Volume, Surface::Planar] {
-            let mut whole = MapRenderer::new(&gpu, &map, surface, usize::MAX).unwrap();
-            let mut slabs = MapRenderer::new(&gpu, &map, surface, 130).unwrap();
-            for turn in [0.0, 0.4, -0.7] {
-                let camera_from_world = Se3::new(Vector3::new(0.0, 0.0, 0.3), Vector3::new(0.0, turn, 0.0));
-                let camera = ViewCamera { pinhole, camera_from_world };
-                let (a, b) = (whole.render(&camera).unwrap(), slabs.render(&camera).unwrap());
-                let pixels = a.color_depth.iter().zip(&b.color_depth);
-                let worst = pixels.map(|(a, b)| (0..3).map(|k| (a[k] - b[k]).abs()).fold(0.0, f32::max)).fold(0.0, f32::max);
-                let light = a.transmittance.iter().zip(&b.transmittance).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-                assert!(worst < 0.01 && light < 0.01, "degree {degree}, {surface:?}, {turn}: {worst} {light}");
-                assert!(a.transmittance.iter().any(|light| *light < 0.5), "there is something to see");
-            }
+        let degree = ShDegree::new(degree).unwrap();
+        let open = crate::common::scene(rng, 900, degree);
+        let mut walled = wall(degree);
+        walled.append(&open);
+        for (map, surface) in
+            [(&open, Surface::Volume), (&open, Surface::Planar), (&walled, Surface::Volume), (&walled, Surface::Planar)]
+        {
+            compare_slabs(&gpu, map, surface);
         }
+    }
+}
+
+/// An opaque wall before the left half of what lies ahead.
+fn wall(degree: ShDegree) -> GaussianCloud {
+    let mut wall = GaussianCloud::new(degree);
+    for (column, row) in (0..20).flat_map(|column| (0..20).map(move |row| (column, row))) {
+        wall.push(Gaussian {
+            mean: Vec3::new(-0.1 * column as f32, 0.1 * (row as f32 - 10.0), 1.0),
+            log_scale: Vec3::new(-2.5, -2.5, -6.0),
+            rotation: Quat::IDENTITY,
+            raw_opacity: 6.0,
+            sh: vec![Vec3::splat(0.5); degree.coefficients()],
+        });
+    }
+    wall
+}
+
+fn compare_slabs(gpu: &Arc<Gpu>, map: &GaussianCloud, surface: Surface) {
+    let pinhole = Pinhole { fx: 60.0, fy: 60.0, cx: 31.5, cy: 23.5, width: 64, height: 48 };
+    let mut whole = MapRenderer::new(gpu, map, surface, usize::MAX).unwrap();
+    let mut slabs = MapRenderer::new(gpu, map, surface, 130).unwrap();
+    for turn in [0.0, 0.4, -0.7] {
+        let camera_from_world = Se3::new(Vector3::new(0.0, 0.0, 0.3), Vector3::new(0.0, turn, 0.0));
+        let camera = ViewCamera { pinhole, camera_from_world };
+        let (a, b) = (whole.render(&camera).unwrap(), slabs.render(&camera).unwrap());
+        let pixels = a.color_depth.iter().zip(&b.color_depth);
+        let worst = pixels.map(|(a, b)| (0..3).map(|k| (a[k] - b[k]).abs()).fold(0.0, f32::max)).fold(0.0, f32::max);
+        let light = a.transmittance.iter().zip(&b.transmittance).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        // Colours reach two.
+        assert!(worst < 0.02 && light < 0.01, "degree {:?}, {surface:?}, {turn}: {worst} {light}", map.sh_degree);
+        assert!(a.transmittance.iter().any(|light| *light < 0.5), "there is something to see");
     }
 }

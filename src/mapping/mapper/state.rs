@@ -27,6 +27,7 @@ pub struct MapperState {
     learnable: Vec<usize>,
     turns: Turns,
     stepped_capacity: usize,
+    inserted: usize,
     keyframes: Vec<KeyframeState>,
     rng: u64,
     step_times: Vec<Duration>,
@@ -50,6 +51,7 @@ impl Mapper {
             learnable: self.learnable.clone(),
             turns: self.turns.clone(),
             stepped_capacity: self.stepped_capacity,
+            inserted: self.inserted,
             keyframes: self.keyframes.iter().map(|keyframe| keyframe.state(&self.gpu, &self.images)).collect::<Result<_, _>>()?,
             rng: self.rng.get_seed(),
             step_times: self.step_times.clone(),
@@ -85,6 +87,7 @@ impl Mapper {
         mapper.learnable = state.learnable.clone();
         mapper.turns = state.turns.clone();
         mapper.stepped_capacity = state.stepped_capacity;
+        mapper.inserted = state.inserted;
         mapper.rng = Rng::with_seed(state.rng);
         mapper.step_times = state.step_times.clone();
         mapper.epoch = state.epoch.clone();

@@ -44,6 +44,7 @@ impl Mapper {
         shown: (Option<&Survey>, &Exposure),
     ) -> Result<usize, MappingError> {
         let mut new = insertion::gaussians(keyframe, candidates, shown, &self.config.insertion, self.config.sh_degree);
+        self.inserted += new.len();
         let limited = self.config.limits.limits_gaussians();
         if limited {
             self.cloud.limit(self.most_gaussians());
@@ -51,7 +52,11 @@ impl Mapper {
         if self.probe(self.cloud.len() + new.len()) || limited {
             self.make_room(new.len())?;
             let most = self.most_gaussians();
-            new = new.thinned(limits::insertions_allowed(new.len(), most));
+            let others = self.inserted - new.len();
+            new = new.thinned(match self.is_trained() {
+                true => limits::insertions_allowed(new.len(), most),
+                false => limits::sampled(new.len(), others, most + self.chunks.gaussians_away()),
+            });
             self.remove_least(self.cloud.len().saturating_sub(most - new.len()))?;
         }
         let left_out = self.cloud.append(&self.gpu, &new)?;
@@ -59,15 +64,21 @@ impl Mapper {
         Ok(new.len())
     }
 
-    /// Removes so many Gaussians of least contribution.
+    /// Removes so many Gaussians: those of least contribution, or evenly spread ones before the first step.
     fn remove_least(&mut self, excess: usize) -> Result<(), MappingError> {
         if excess == 0 {
             return Ok(());
         }
         let frozen = self.cloud.frozen();
-        let histories: Vec<GaussianHistory> = self.cloud.histories().read(&self.gpu, frozen, self.cloud.len() - frozen)?;
-        let scored_round = self.cloud.rounds() as f32 - self.config.density.every as f32;
-        let mut least = limits::least_contributions(&histories, excess.min(histories.len()), scored_round);
+        let count = self.cloud.len() - frozen;
+        let excess = excess.min(count);
+        let mut least = if self.is_trained() {
+            let histories: Vec<GaussianHistory> = self.cloud.histories().read(&self.gpu, frozen, count)?;
+            let scored_round = self.cloud.rounds() as f32 - self.config.density.every as f32;
+            limits::least_contributions(&histories, excess, scored_round)
+        } else {
+            (0..excess).map(|i| ((2 * i + 1) * count / (2 * excess)) as u32).collect()
+        };
         least.iter_mut().for_each(|gaussian| *gaussian += frozen as u32);
         self.change(&Plan::removing(least))
     }
