@@ -257,6 +257,11 @@ impl Trainer {
         self.rasterizer.render(cloud, camera, background)
     }
 
+    /// Bytes by which scratch buffers grow for a view that has a few more intersections than they have room for.
+    pub fn growth_bytes(&self) -> u64 {
+        self.rasterizer.growth_bytes()
+    }
+
     /// The form of the blending passes.
     pub fn form(&self) -> BlendForm {
         self.rasterizer.form()

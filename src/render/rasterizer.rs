@@ -148,6 +148,11 @@ impl Rasterizer {
         self.workspace.capacities()
     }
 
+    /// Bytes by which the scratch buffers grow for a view that has a few more intersections than they have room for.
+    pub fn growth_bytes(&self) -> u64 {
+        self.workspace.growth_bytes()
+    }
+
     /// Reserves scratch buffers of the given capacities.
     ///
     /// # Errors

@@ -8,6 +8,10 @@ use crate::gpu::{Gpu, GpuBuffer, GpuError};
 /// Bytes of one intersection's gradient: three vec4.
 const INTERSECTION_GRADIENT_BYTES: u64 = 48;
 
+const EMPTY_BYTES: u64 = 16;
+/// Where a view has more intersections than there is room for, the buffers get room for a part in so many beyond them.
+const MARGIN_DIVISOR: usize = 4;
+
 /// Scratch that one rendered view leaves behind for its backward pass. Sizes only grow.
 #[derive(Debug)]
 pub(crate) struct Workspace {
@@ -52,7 +56,7 @@ pub struct Capacities {
 impl Workspace {
     pub(super) fn new(gpu: &Gpu, blending: Blending) -> Result<Self, GpuError> {
         let (capacity, intersection_capacity) = (16_384, 131_072);
-        let empty = |label: &str| GpuBuffer::storage(gpu, label, 16);
+        let empty = |label: &str| GpuBuffer::storage(gpu, label, EMPTY_BYTES);
         let mut workspace = Self {
             blending,
             counters: GpuBuffer::storage(gpu, "counters", u64::from(COUNTERS) * std::mem::size_of::<Counter>() as u64)?,
@@ -84,6 +88,13 @@ impl Workspace {
         Capacities { gaussians: self.capacity, intersections: self.intersection_capacity, pixels: self.pixels, tiles: self.tiles }
     }
 
+    /// Bytes by which a view that has a few more intersections lets the buffers grow.
+    pub(super) fn growth_bytes(&self) -> u64 {
+        let each = 5 * 4 + INTERSECTION_GRADIENT_BYTES;
+        let grown = self.intersection_capacity / MARGIN_DIVISOR;
+        grown as u64 * each + self.blending.checkpoint_bytes(grown)
+    }
+
     /// Reserves exactly these capacities: that of intersections decides which steps overflow and are repeated.
     pub(super) fn reserve(&mut self, gpu: &Gpu, capacities: Capacities) -> Result<(), GpuError> {
         self.reserve_gaussians(gpu, capacities.gaussians)?;
@@ -96,6 +107,9 @@ impl Workspace {
             return Ok(());
         }
         let words = |label: &str| GpuBuffer::storage(gpu, label, capacity as u64 * 4);
+        // The largest buffer goes before its successor comes. After a failure there is room for nothing, which the next view reserves.
+        self.capacity = 0;
+        self.projected = GpuBuffer::storage(gpu, "projected", EMPTY_BYTES)?;
         self.projected = GpuBuffer::storage(gpu, "projected", capacity as u64 * u64::from(self.blending.projected()) * 16)?;
         self.visible = words("visible")?;
         self.block_sums = GpuBuffer::storage(gpu, "block sums", (capacity as u64).div_ceil(256) * 4)?;
@@ -112,11 +126,13 @@ impl Workspace {
             return Ok(());
         }
         let most = (gpu.max_storage_bytes() / INTERSECTION_GRADIENT_BYTES) as usize;
-        self.grow_intersections(gpu, (needed + needed / 4).min(most).max(needed))
+        self.grow_intersections(gpu, (needed + needed / MARGIN_DIVISOR).min(most).max(needed))
     }
 
     fn grow_intersections(&mut self, gpu: &Gpu, capacity: usize) -> Result<(), GpuError> {
         let words = |label: &str| GpuBuffer::storage(gpu, label, capacity as u64 * 4);
+        self.intersection_capacity = 0;
+        self.intersection_gradients = GpuBuffer::storage(gpu, "intersection gradients", EMPTY_BYTES)?;
         self.tile_keys = [words("tile keys")?, words("tile keys")?];
         self.slots = [words("slots")?, words("slots")?];
         self.slot_gaussians = words("slot Gaussians")?;

@@ -95,10 +95,11 @@ impl Mapper {
         self.config.limits.gaussians(self.chunks.gaussians_away()).min(self.most_on_gpu())
     }
 
-    /// How many of them its memory has room for, when there is to be room for one more keyframe's image.
+    /// How many of them its memory has room for, when there is to be room for one more keyframe's image and the growth of a
+    /// view's buffers.
     pub(super) fn most_on_gpu(&self) -> usize {
-        let other =
-            LimitsConfig::other_bytes(self.gpu.bytes() + self.largest_image_bytes(), self.cloud.bytes(), self.stepped_capacity);
+        let kept = self.largest_image_bytes() + self.trainer.growth_bytes();
+        let other = LimitsConfig::other_bytes(self.gpu.bytes() + kept, self.cloud.bytes(), self.stepped_capacity);
         self.config.limits.gaussians_on_gpu(self.cloud.bytes_each(), other).min(self.cloud.most(&self.gpu))
     }
 
