@@ -55,7 +55,7 @@ impl Mapper {
             let others = self.inserted - new.len();
             new = new.thinned(match self.is_trained() {
                 true => limits::insertions_allowed(new.len(), most),
-                false => limits::sampled(new.len(), others, most + self.chunks.gaussians_away()),
+                false => limits::sampled(new.len(), others, most + self.chunks.gaussians_away()).min(most),
             });
             self.remove_least(self.cloud.len().saturating_sub(most - new.len()))?;
         }
