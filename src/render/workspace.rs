@@ -8,6 +8,7 @@ use crate::gpu::{Gpu, GpuBuffer, GpuError};
 /// Bytes of one intersection's gradient: three vec4.
 const INTERSECTION_GRADIENT_BYTES: u64 = 48;
 
+/// Bytes of a buffer whose size is not known yet.
 const EMPTY_BYTES: u64 = 16;
 /// Where a view has more intersections than there is room for, the buffers get room for a part in so many beyond them.
 const MARGIN_DIVISOR: usize = 4;
@@ -131,6 +132,7 @@ impl Workspace {
 
     fn grow_intersections(&mut self, gpu: &Gpu, capacity: usize) -> Result<(), GpuError> {
         let words = |label: &str| GpuBuffer::storage(gpu, label, capacity as u64 * 4);
+        // As above.
         self.intersection_capacity = 0;
         self.intersection_gradients = GpuBuffer::storage(gpu, "intersection gradients", EMPTY_BYTES)?;
         self.tile_keys = [words("tile keys")?, words("tile keys")?];
