@@ -9,7 +9,7 @@ use glam::{Quat, Vec3};
 use serde::{Deserialize, Serialize};
 
 pub use motion::Motions;
-pub use part::CloudPart;
+pub use part::{CloudPart, Extent};
 
 use self::change::Kernels;
 use super::layout::GEOMETRY_PLANES;

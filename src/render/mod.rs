@@ -11,7 +11,7 @@ mod slabs;
 mod sort;
 mod workspace;
 
-pub use cloud::{CloudPart, CloudState, GaussianHistory, GpuCloud, Motions};
+pub use cloud::{CloudPart, CloudState, Extent, GaussianHistory, GpuCloud, Motions};
 pub use layout::{BlendForm, Blending, HIDDEN};
 pub use plan::{Division, Plan};
 pub use rasterizer::{PreparedView, Rasterizer, ViewCounts};

@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::{Ball, ChunkId, Outlook};
+use super::{ChunkId, OrientedBox, Outlook};
 use crate::mapping::KeyframeId;
 
 /// Side of a cell, metres. It decides how long a search takes, not what it finds.
@@ -10,9 +10,9 @@ const CELL_METRES: f32 = 4.0;
 
 #[derive(Debug)]
 struct Cell {
-    /// Around the balls of all that came into it.
-    ball: Ball,
-    chunks: BTreeMap<ChunkId, Ball>,
+    /// Around the boxes of all that came into it.
+    bounds: OrientedBox,
+    chunks: BTreeMap<ChunkId, OrientedBox>,
 }
 
 /// All chunks that are away.
@@ -23,14 +23,14 @@ pub(super) struct Index {
 }
 
 impl Index {
-    pub fn insert(&mut self, id: ChunkId, ball: Ball) {
-        let cell = self.cells.entry(cell_of(&ball)).or_insert_with(|| Cell { ball, chunks: BTreeMap::new() });
-        cell.ball = Ball::around_balls(&[cell.ball, ball]);
-        cell.chunks.insert(id, ball);
+    pub fn insert(&mut self, id: ChunkId, bounds: OrientedBox) {
+        let cell = self.cells.entry(cell_of(&bounds)).or_insert_with(|| Cell { bounds, chunks: BTreeMap::new() });
+        cell.bounds = OrientedBox::around_boxes(&[cell.bounds, bounds]);
+        cell.chunks.insert(id, bounds);
     }
 
-    pub fn remove(&mut self, id: ChunkId, ball: &Ball) {
-        let key = cell_of(ball);
+    pub fn remove(&mut self, id: ChunkId, bounds: &OrientedBox) {
+        let key = cell_of(bounds);
         if let Some(cell) = self.cells.get_mut(&key) {
             cell.chunks.remove(&id);
             if cell.chunks.is_empty() {
@@ -60,26 +60,27 @@ impl Index {
     }
 
     /// Chunks that a view sees, in any order.
-    pub fn seen_by<'a>(&'a self, outlook: &'a Outlook<'_>) -> impl Iterator<Item = (ChunkId, &'a Ball)> {
-        let cells = self.cells.values().filter(|cell| outlook.faces(&cell.ball));
-        cells.flat_map(|cell| &cell.chunks).filter(|(_, ball)| outlook.sees(ball)).map(|(id, ball)| (*id, ball))
+    pub fn seen_by<'a>(&'a self, outlook: &'a Outlook<'_>) -> impl Iterator<Item = (ChunkId, &'a OrientedBox)> {
+        let cells = self.cells.values().filter(|cell| outlook.faces(&cell.bounds));
+        cells.flat_map(|cell| &cell.chunks).filter(|(_, bounds)| outlook.sees(bounds)).map(|(id, bounds)| (*id, bounds))
     }
 }
 
-impl<'a> FromIterator<(ChunkId, &'a Ball)> for Index {
-    fn from_iter<T: IntoIterator<Item = (ChunkId, &'a Ball)>>(chunks: T) -> Self {
+impl<'a> FromIterator<(ChunkId, &'a OrientedBox)> for Index {
+    fn from_iter<T: IntoIterator<Item = (ChunkId, &'a OrientedBox)>>(chunks: T) -> Self {
         let mut index = Self::default();
-        chunks.into_iter().for_each(|(id, ball)| index.insert(id, *ball));
+        chunks.into_iter().for_each(|(id, bounds)| index.insert(id, *bounds));
         index
     }
 }
 
-fn cell_of(ball: &Ball) -> [i32; 3] {
-    ball.center().to_array().map(|coordinate| (coordinate / CELL_METRES).floor() as i32)
+fn cell_of(bounds: &OrientedBox) -> [i32; 3] {
+    bounds.center().to_array().map(|coordinate| (coordinate / CELL_METRES).floor() as i32)
 }
 
 #[cfg(test)]
 mod tests {
+    use glam::Vec3;
     use image::RgbImage;
     use proptest::prelude::*;
 
@@ -89,10 +90,14 @@ mod tests {
     use crate::sequence::{DepthImage, RectifiedImage};
     use crate::splat::ViewCamera;
 
+    fn cube(center: Vec3, half: f32) -> OrientedBox {
+        OrientedBox::new(center, [half * Vec3::X, half * Vec3::Y, half * Vec3::Z])
+    }
+
     proptest! {
         #[test]
         fn the_index_finds_what_a_look_at_each_finds(
-            balls in prop::collection::vec(prop::array::uniform4(-12.0f32..12.0), 1..80),
+            boxes in prop::collection::vec(prop::array::uniform4(-12.0f32..12.0), 1..80),
             (x, turn, depth) in (-8.0f64..8.0, -3.0f64..3.0, 1.0f32..9.0),
             removed in prop::collection::vec(any::<prop::sample::Index>(), 0..20),
         ) {
@@ -102,17 +107,17 @@ mod tests {
             let camera_from_world = Se3::new([x, 0.0, 0.5].into(), [0.0, turn, 0.0].into());
             let sight = Sight::of(&image);
             let outlook = sight.from(&ViewCamera { pinhole, camera_from_world });
-            let mut chunks: BTreeMap<ChunkId, Ball> =
-                (0..).zip(balls).map(|(id, [x, y, z, r])| (id, Ball([x, y, z, r.abs() / 8.0]))).collect();
-            let mut index: Index = chunks.iter().map(|(id, ball)| (*id, ball)).collect();
+            let mut chunks: BTreeMap<ChunkId, OrientedBox> =
+                (0..).zip(boxes).map(|(id, [x, y, z, r])| (id, cube(Vec3::new(x, y, z), r.abs() / 8.0))).collect();
+            let mut index: Index = chunks.iter().map(|(id, bounds)| (*id, bounds)).collect();
             for which in removed {
                 let id = which.index(100) as ChunkId;
-                if let Some(ball) = chunks.remove(&id) {
-                    index.remove(id, &ball);
+                if let Some(bounds) = chunks.remove(&id) {
+                    index.remove(id, &bounds);
                 }
             }
             let found: BTreeSet<ChunkId> = index.seen_by(&outlook).map(|(id, _)| id).collect();
-            let expected: BTreeSet<ChunkId> = chunks.iter().filter(|(_, ball)| outlook.sees(ball)).map(|(id, _)| *id).collect();
+            let expected: BTreeSet<ChunkId> = chunks.iter().filter(|(_, bounds)| outlook.sees(bounds)).map(|(id, _)| *id).collect();
             prop_assert_eq!(found, expected);
         }
     }

@@ -1,8 +1,8 @@
 //! Out-of-core mapping: Gaussians that no keyframe near by sees leave the GPU for the disk, and come back when one does, as in DiskChunGS.
 //!
-//! A chunk is a few dozen neighbours, divided anew each time Gaussians leave. A ball around it says which keyframes see it.
+//! A chunk is a few dozen neighbours, divided anew each time Gaussians leave. A box around it says which keyframes see it.
 
-mod balls;
+mod boxes;
 mod index;
 mod sight;
 mod store;
@@ -13,7 +13,7 @@ use std::sync::{Mutex, PoisonError};
 
 use serde::{Deserialize, Serialize};
 
-pub(super) use self::balls::{Ball, parts};
+pub(super) use self::boxes::{OrientedBox, parts};
 use self::index::Index;
 pub(super) use self::sight::{Hidden, Outlook, Sight};
 use self::store::{Store, Stored};
@@ -46,7 +46,7 @@ pub(super) struct Members {
 /// Neighbouring Gaussians that are not on the GPU.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 struct Chunk {
-    ball: Ball,
+    bounds: OrientedBox,
     gaussians: usize,
     /// Round of density control in which it left.
     round: u32,
@@ -168,22 +168,22 @@ impl Chunks {
         let mut seen = self.index.seen_by(outlook).peekable();
         seen.peek()?;
         let mut hidden = outlook.nothing_hidden();
-        seen.for_each(|(_, ball)| outlook.hide(ball, &mut hidden));
+        seen.for_each(|(_, bounds)| outlook.hide(bounds, &mut hidden));
         Some(hidden)
     }
 
     /// Whether all is here that this share of a view's image shows.
     pub fn is_here(&self, outlook: &Outlook<'_>, share: f32) -> bool {
         let mut hidden = outlook.nothing_hidden();
-        self.index.seen_by(outlook).all(|(_, ball)| {
-            outlook.hide(ball, &mut hidden);
+        self.index.seen_by(outlook).all(|(_, bounds)| {
+            outlook.hide(bounds, &mut hidden);
             hidden.seen() >= share
         })
     }
 
     /// Chunks that a view sees, the nearest first.
     pub fn seen_by(&self, outlook: &Outlook<'_>) -> Vec<ChunkId> {
-        let mut seen: Vec<(f32, ChunkId)> = self.index.seen_by(outlook).map(|(id, ball)| (outlook.depth(ball), id)).collect();
+        let mut seen: Vec<(f32, ChunkId)> = self.index.seen_by(outlook).map(|(id, bounds)| (outlook.depth(bounds), id)).collect();
         seen.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
         seen.into_iter().map(|(_, id)| id).collect()
     }
@@ -196,7 +196,7 @@ impl Chunks {
         let mut keyframes = BTreeMap::new();
         members.keyframes.iter().for_each(|keyframe| *keyframes.entry(*keyframe).or_default() += 1);
         let chunk = Chunk {
-            ball: Ball::around(&members.part.extents()),
+            bounds: OrientedBox::around(&members.part.extents()),
             gaussians: members.part.len(),
             round,
             keyframes,
@@ -206,7 +206,7 @@ impl Chunks {
         self.state.gaussians += chunk.gaussians;
         self.state.figures.gaussians_out += chunk.gaussians as u64;
         self.state.figures.most_away = self.state.figures.most_away.max(self.state.gaussians as u64);
-        self.index.insert(id, chunk.ball);
+        self.index.insert(id, chunk.bounds);
         self.index.name(id, chunk.keyframes.keys());
         self.state.away.insert(id, chunk);
     }
@@ -240,7 +240,7 @@ impl Chunks {
     fn forget(&mut self, id: ChunkId) {
         let Some(chunk) = self.state.away.remove(&id) else { return };
         self.state.gaussians -= chunk.gaussians;
-        self.index.remove(id, &chunk.ball);
+        self.index.remove(id, &chunk.bounds);
         self.index.forget(id, chunk.keyframes.keys());
         self.returned.push(Returned { id, chunk, in_snapshot: true, in_checkpoint: self.lasting });
     }
@@ -251,20 +251,20 @@ impl Chunks {
         let mut moved = 0;
         for id in index.of_keyframes(motions.keys()) {
             let Some(chunk) = state.away.get_mut(&id) else { continue };
-            index.remove(id, &chunk.ball);
-            let mut reached: Vec<Ball> = Vec::new();
+            index.remove(id, &chunk.bounds);
+            let mut reached: Vec<OrientedBox> = Vec::new();
             for (keyframe, gaussians) in &chunk.keyframes {
-                let mut ball = chunk.ball;
+                let mut bounds = chunk.bounds;
                 if let Some(new_from_old) = motions.get(keyframe) {
                     moved += gaussians;
                     let before = chunk.motions.get(keyframe).copied().unwrap_or(Sim3::identity());
                     chunk.motions.insert(*keyframe, *new_from_old * before);
-                    ball.transform(new_from_old);
+                    bounds.transform(new_from_old);
                 }
-                reached.push(ball);
+                reached.push(bounds);
             }
-            chunk.ball = Ball::around_balls(&reached);
-            index.insert(id, chunk.ball);
+            chunk.bounds = OrientedBox::around_boxes(&reached);
+            index.insert(id, chunk.bounds);
         }
         moved
     }
@@ -309,7 +309,7 @@ impl Chunks {
 
 impl ChunksState {
     fn index(&self) -> Index {
-        let mut index: Index = self.away.iter().map(|(id, chunk)| (*id, &chunk.ball)).collect();
+        let mut index: Index = self.away.iter().map(|(id, chunk)| (*id, &chunk.bounds)).collect();
         self.away.iter().for_each(|(id, chunk)| index.name(*id, chunk.keyframes.keys()));
         index
     }

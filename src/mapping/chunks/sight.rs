@@ -1,11 +1,11 @@
-//! What a keyframe can see: how deep its image is, block by block, and which balls lie in it. Found on the CPU, by the keyframe's own depth, so that
+//! What a keyframe can see: how deep its image is, block by block, and which boxes lie in it. Found on the CPU, by the keyframe's own depth, so that
 //! what walls hide counts as unseen.
 
 use glam::Vec3;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::Ball;
+use super::OrientedBox;
 use crate::geometry::Pinhole;
 use crate::gpu::plain;
 use crate::optimise::Pixels;
@@ -73,9 +73,9 @@ pub(in crate::mapping) struct Outlook<'a> {
 }
 
 impl Outlook<'_> {
-    /// Whether a part of the ball lies in the image and not behind all that the image shows there.
-    pub fn sees(&self, ball: &Ball) -> bool {
-        self.reaches(ball, |_| true)
+    /// Whether a part of the box lies in the image and not behind all that the image shows there.
+    pub fn sees(&self, bounds: &OrientedBox) -> bool {
+        self.reaches(bounds, |_| true)
     }
 
     /// Nothing of the image is hidden yet.
@@ -84,70 +84,117 @@ impl Outlook<'_> {
         Hidden { columns: self.sight.columns, blocks: vec![false; blocks], left: blocks }
     }
 
-    /// Where the ball is seen, the image counts as hidden.
-    pub fn hide(&self, ball: &Ball, hidden: &mut Hidden) {
+    /// Where the box is seen, the image counts as hidden.
+    pub fn hide(&self, bounds: &OrientedBox, hidden: &mut Hidden) {
         let hide = |block: usize| {
             hidden.left -= usize::from(!std::mem::replace(&mut hidden.blocks[block], true));
             false
         };
-        self.reaches(ball, hide);
+        self.reaches(bounds, hide);
     }
 
-    /// Goes through the blocks in which the ball is seen until `found` ends that; returns whether it did.
-    fn reaches(&self, ball: &Ball, mut found: impl FnMut(usize) -> bool) -> bool {
-        let along = |axis: usize| self.axes[axis].dot(ball.center()) + self.translation[axis];
-        let (z, radius) = (along(2), ball.radius());
-        if z + radius < NEAR_METRES as f32 || !self.is_within(along(0), along(1), z, radius) {
-            return false;
-        }
+    /// Whether the box is seen in a hidden block.
+    pub fn is_hidden(&self, bounds: &OrientedBox, hidden: &Hidden) -> bool {
+        self.reaches(bounds, |block| hidden.blocks[block])
+    }
+
+    /// Goes through the blocks in which the box is seen until `found` ends that; returns whether it did.
+    fn reaches(&self, bounds: &OrientedBox, mut found: impl FnMut(usize) -> bool) -> bool {
+        let Some(InView { center, half_axes, nearest }) = self.in_view(bounds) else { return false };
         let (columns, rows) = (self.sight.columns, self.sight.farthest.len() as u32 / self.sight.columns);
-        let nearest = z - radius;
         if nearest < NEAR_METRES as f32 {
             // It surrounds the camera, or reaches through the image's plane: its outline says nothing.
             return (0..self.sight.farthest.len()).any(found);
         }
-        // Within a ball, x/z differs from that of its middle by no more than r·√(z² + x²) / (z·(z - r)).
-        let blocks = |center: f32, focal: f64, middle: f64, count: u32| {
-            let slope = center / z;
-            let (pixel, reach) =
-                (focal as f32 * slope + middle as f32, focal as f32 * radius * (1.0 + slope * slope).sqrt() / nearest + EDGE);
-            let block = |pixel: f32| (pixel + 0.5) / BLOCK as f32;
-            let (low, high) = (block(pixel - reach).floor().max(0.0), block(pixel + reach).floor().min(count as f32 - 1.0));
+        let (mut low, mut high) = ([f32::INFINITY; 2], [f32::NEG_INFINITY; 2]);
+        for corner in 0..8 {
+            let along = |axis: usize| if corner >> axis & 1 == 1 { half_axes[axis] } else { -half_axes[axis] };
+            let corner = center + along(0) + along(1) + along(2);
+            // Rounding may leave a corner a little before the nearest.
+            let slopes = [corner.x, corner.y].map(|across| across / corner.z.max(nearest));
+            for side in 0..2 {
+                (low[side], high[side]) = (low[side].min(slopes[side]), high[side].max(slopes[side]));
+            }
+        }
+        let blocks = |side: usize, focal: f64, middle: f64, count: u32| {
+            let pixel = |slope: f32| focal as f32 * slope + middle as f32;
+            let block = |pixel: f32| ((pixel + 0.5) / BLOCK as f32).floor();
+            let (low, high) = (block(pixel(low[side]) - EDGE).max(0.0), block(pixel(high[side]) + EDGE).min(count as f32 - 1.0));
             low as u32..(high + 1.0).max(0.0) as u32
         };
-        let across = blocks(along(0), self.pinhole.fx, self.pinhole.cx, columns);
-        let down = blocks(along(1), self.pinhole.fy, self.pinhole.cy, rows);
+        let across = blocks(0, self.pinhole.fx, self.pinhole.cx, columns);
+        let down = blocks(1, self.pinhole.fy, self.pinhole.cy, rows);
         down.into_iter().any(|row| {
             let mut blocks = across.clone().map(|column| (row * columns + column) as usize);
             blocks.any(|block| self.sight.farthest[block] * DEPTH_MARGIN >= nearest && found(block))
         })
     }
 
-    /// Whether the view may see a ball within this one: a coarser question than [`Self::sees`].
-    pub fn faces(&self, ball: &Ball) -> bool {
-        let along = |axis: usize| self.axes[axis].dot(ball.center()) + self.translation[axis];
-        let (z, radius) = (along(2), ball.radius());
-        let is_within_depth = z + radius >= NEAR_METRES as f32 && z - radius <= self.most * DEPTH_MARGIN;
-        is_within_depth && self.is_within(along(0), along(1), z, radius)
+    /// Whether the view may see a box within this one: a coarser question than [`Self::sees`].
+    pub fn faces(&self, bounds: &OrientedBox) -> bool {
+        self.in_view(bounds).is_some()
     }
 
-    /// Depth of the ball's middle, metres.
-    pub fn depth(&self, ball: &Ball) -> f32 {
-        self.axes[2].dot(ball.center()) + self.translation[2]
-    }
-
-    /// Whether a ball reaches into the pyramid of the view.
-    fn is_within(&self, x: f32, y: f32, z: f32, radius: f32) -> bool {
+    /// In how many pixels the view shows what lies in the middle of the box, compared with other views of it: the inverse square of its distance. None
+    /// where the middle is not in the image, or behind what the image shows there.
+    pub fn share_of_pixels(&self, bounds: &OrientedBox) -> f32 {
+        let center = self.turned(bounds.center()) + Vec3::from(self.translation);
+        if center.z < NEAR_METRES as f32 {
+            return 0.0;
+        }
+        let Pinhole { fx, fy, cx, cy, .. } = self.pinhole;
+        let block = |across: f32, focal: f64, middle: f64| {
+            ((focal as f32 * across / center.z + middle as f32 + 0.5) / BLOCK as f32).floor()
+        };
+        let (x, y) = (block(center.x, fx, cx), block(center.y, fy, cy));
         let (columns, rows) = (self.sight.columns, self.sight.farthest.len() as u32 / self.sight.columns);
-        let side = |center: f32, focal: f64, middle: f64, blocks: u32| {
+        let is_in_image = (0.0..columns as f32).contains(&x) && (0.0..rows as f32).contains(&y);
+        let shows = |x: u32, y: u32| self.sight.farthest[(y * columns + x) as usize] * DEPTH_MARGIN >= center.z;
+        if is_in_image && shows(x as u32, y as u32) { 1.0 / center.length_squared() } else { 0.0 }
+    }
+
+    /// Depth of the box's middle, metres.
+    pub fn depth(&self, bounds: &OrientedBox) -> f32 {
+        self.axes[2].dot(bounds.center()) + self.translation[2]
+    }
+
+    /// The box in the camera's frame; none if it does not reach into the pyramid of the view, or lies behind all that the view shows.
+    fn in_view(&self, bounds: &OrientedBox) -> Option<InView> {
+        let center = self.turned(bounds.center()) + Vec3::from(self.translation);
+        let half_axes = bounds.half_axes().map(|axis| self.turned(axis));
+        let reach = |normal: Vec3| half_axes.iter().map(|axis| axis.dot(normal).abs()).sum::<f32>();
+        let depth_reach = reach(Vec3::Z);
+        let nearest = center.z - depth_reach;
+        if center.z + depth_reach < NEAR_METRES as f32 || nearest > self.most * DEPTH_MARGIN {
+            return None;
+        }
+        let (columns, rows) = (self.sight.columns, self.sight.farthest.len() as u32 / self.sight.columns);
+        // Planes through the camera and a side of the image.
+        let is_inside = |axis: usize, focal: f64, middle: f64, blocks: u32| {
             let slope = |pixel: f64| ((pixel - 0.5 - middle) / focal) as f32;
             let (low, high) = (slope(-f64::from(EDGE)), slope(f64::from(blocks * BLOCK) + f64::from(EDGE)));
-            let distance = |slope: f32, sign: f32| sign * (center - slope * z) / (1.0 + slope * slope).sqrt();
-            distance(low, 1.0) > -radius && distance(high, -1.0) > -radius
+            [(low, 1.0), (high, -1.0)].into_iter().all(|(slope, inwards)| {
+                let mut normal = Vec3::new(0.0, 0.0, -slope);
+                normal[axis] = 1.0;
+                let normal = inwards * normal / (1.0 + slope * slope).sqrt();
+                normal.dot(center) > -reach(normal)
+            })
         };
         let Pinhole { fx, fy, cx, cy, .. } = self.pinhole;
-        side(x, fx, cx, columns) && side(y, fy, cy, rows)
+        (is_inside(0, fx, cx, columns) && is_inside(1, fy, cy, rows)).then_some(InView { center, half_axes, nearest })
     }
+
+    fn turned(&self, v: Vec3) -> Vec3 {
+        Vec3::from(self.axes.map(|axis| axis.dot(v)))
+    }
+}
+
+/// A box in the camera's frame, metres.
+struct InView {
+    center: Vec3,
+    half_axes: [Vec3; 3],
+    /// Depth of its nearest corner.
+    nearest: f32,
 }
 
 /// Blocks of an image that show something that is away.
@@ -197,34 +244,44 @@ mod tests {
         (Sight::of(&image), ViewCamera { pinhole, camera_from_world: Se3::identity() })
     }
 
-    fn ball(x: f32, y: f32, z: f32, radius: f32) -> Ball {
-        Ball([x, y, z, radius])
+    fn cube(x: f32, y: f32, z: f32, half: f32) -> OrientedBox {
+        OrientedBox::new(Vec3::new(x, y, z), [half * Vec3::X, half * Vec3::Y, half * Vec3::Z])
     }
 
     #[test]
     fn what_lies_before_the_surface_is_seen_and_what_lies_behind_is_not() {
         let (sight, camera) = sight();
         let outlook = sight.from(&camera);
-        for (seen, ball) in [
-            (true, ball(-0.5, 0.0, 1.9, 0.1)),
-            (true, ball(-0.5, 0.0, 2.1, 0.1)),
-            (false, ball(-0.8, 0.0, 2.5, 0.1)),
-            (true, ball(0.8, 0.0, 2.5, 0.1)),
-            (true, ball(1.0, 0.0, 9.2, 0.1)),
-            (false, ball(1.0, 0.0, 9.6, 0.1)),
-            (false, ball(0.0, 0.0, -1.0, 0.5)),
-            (true, ball(0.0, 0.0, -0.2, 0.5)),
-            (false, ball(3.0, 0.0, 2.0, 0.2)),
-            (false, ball(-3.0, 0.0, 0.2, 0.5)),
-            (false, ball(0.0, 5.0, 2.0, 0.2)),
-            (true, ball(1.7, 0.0, 3.0, 0.4)),
+        for (seen, cube) in [
+            (true, cube(-0.5, 0.0, 1.9, 0.1)),
+            (true, cube(-0.5, 0.0, 2.1, 0.1)),
+            (false, cube(-0.8, 0.0, 2.5, 0.1)),
+            (true, cube(0.8, 0.0, 2.5, 0.1)),
+            (true, cube(1.0, 0.0, 9.2, 0.1)),
+            (false, cube(1.0, 0.0, 9.6, 0.1)),
+            (false, cube(0.0, 0.0, -1.0, 0.5)),
+            (true, cube(0.0, 0.0, -0.2, 0.5)),
+            (false, cube(3.0, 0.0, 2.0, 0.2)),
+            (false, cube(-3.0, 0.0, 0.2, 0.5)),
+            (false, cube(0.0, 5.0, 2.0, 0.2)),
+            (true, cube(1.7, 0.0, 3.0, 0.4)),
         ] {
-            assert_eq!(outlook.sees(&ball), seen, "{ball:?}");
-            assert!(!seen || outlook.faces(&ball), "{ball:?}");
+            assert_eq!(outlook.sees(&cube), seen, "{cube:?}");
+            assert!(!seen || outlook.faces(&cube), "{cube:?}");
             let mut hidden = outlook.nothing_hidden();
-            outlook.hide(&ball, &mut hidden);
-            assert_eq!(hidden.seen() < 1.0, seen, "{ball:?}");
+            outlook.hide(&cube, &mut hidden);
+            assert_eq!(hidden.seen() < 1.0, seen, "{cube:?}");
         }
+    }
+
+    #[test]
+    fn near_views_have_more_pixels_of_it_and_walls_leave_none() {
+        let (sight, camera) = sight();
+        let outlook = sight.from(&camera);
+        let pixels = |x: f32, z: f32| outlook.share_of_pixels(&cube(x, 0.0, z, 0.3));
+        assert!((pixels(0.4, 4.0) / pixels(0.8, 8.0) - 4.0).abs() < 1e-4);
+        assert!(pixels(-0.5, 2.0) > 0.0 && pixels(-0.5, 2.1) == 0.0);
+        assert_eq!([pixels(0.0, -1.0), pixels(3.0, 2.0), pixels(0.5, 9.5)], [0.0; 3]);
     }
 
     #[test]
@@ -233,7 +290,7 @@ mod tests {
         let outlook = sight.from(&camera);
         let mut hidden = outlook.nothing_hidden();
         // In the opening, beside the wall and partly behind it.
-        outlook.hide(&ball(0.2, 0.0, 4.0, 0.4), &mut hidden);
+        outlook.hide(&cube(0.2, 0.0, 4.0, 0.4), &mut hidden);
         let mut shares = Vec::new();
         for (width, halved) in [(64, false), (32, true)] {
             let count = (width * width * 3 / 4) as usize;
@@ -252,10 +309,10 @@ mod tests {
     fn the_camera_moves_and_depth_may_be_unknown() {
         let (mut sight, camera) = sight();
         let moved = ViewCamera { camera_from_world: Se3::translation(0.0, 0.0, -10.0), ..camera };
-        assert!(sight.from(&moved).sees(&ball(-0.5, 0.0, 11.5, 0.1)) && !sight.from(&moved).sees(&ball(-0.5, 0.0, 1.5, 0.1)));
+        assert!(sight.from(&moved).sees(&cube(-0.5, 0.0, 11.5, 0.1)) && !sight.from(&moved).sees(&cube(-0.5, 0.0, 1.5, 0.1)));
         sight.scale(2.0);
-        assert!(sight.from(&camera).sees(&ball(-0.8, 0.0, 2.5, 0.1)));
+        assert!(sight.from(&camera).sees(&cube(-0.8, 0.0, 2.5, 0.1)));
         let image = RectifiedImage { pinhole: camera.pinhole, color: RgbImage::new(64, 48), depth: None, valid: None };
-        assert!(Sight::of(&image).from(&camera).sees(&ball(0.0, 0.0, 1e4, 0.1)));
+        assert!(Sight::of(&image).from(&camera).sees(&cube(0.0, 0.0, 1e4, 0.1)));
     }
 }

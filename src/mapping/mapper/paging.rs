@@ -6,7 +6,7 @@ use std::collections::BTreeSet;
 use rayon::prelude::*;
 
 use super::Mapper;
-use crate::mapping::chunks::{Ball, ChunkId, Members, parts};
+use crate::mapping::chunks::{ChunkId, Members, OrientedBox, Outlook, parts};
 use crate::mapping::{MappingError, schedule};
 use crate::render::{CloudPart, Plan};
 use crate::splat::GaussianCloud;
@@ -16,7 +16,7 @@ pub(super) const FREE_DIVISOR: usize = 8;
 
 /// Neighbouring Gaussians on the GPU.
 pub(super) struct Group {
-    pub ball: Ball,
+    pub bounds: OrientedBox,
     /// In map order.
     pub places: Vec<u32>,
 }
@@ -90,21 +90,26 @@ impl Mapper {
         self.page_out(&leaving)
     }
 
-    /// Groups on the GPU that neither a needing keyframe sees, nor one near the first of these: as many of the nearest as have room for what they see.
+    /// Groups on the GPU that neither a needing keyframe sees, nor one near the first of these: as many have room for what they see, those first that see
+    /// most of what the needing ones see.
     fn unseen(&self, room: usize) -> Result<Vec<Group>, MappingError> {
-        let mut unseen = self.groups()?;
-        let mut kept = self.cloud.frozen();
-        let near = self.keyframes_near(self.needing[0]);
-        for (rank, k) in self.needing.iter().chain(&near).enumerate() {
-            let outlook = self.keyframes[*k].outlook();
-            let is_seen: Vec<bool> = unseen.par_iter().map(|group| outlook.sees(&group.ball)).collect();
-            let seen = unseen.iter().zip(&is_seen).filter(|(_, is_seen)| **is_seen);
-            kept += seen.map(|(group, _)| group.places.len()).sum::<usize>();
-            if kept > room && rank >= self.needing.len() {
+        let needing: Vec<Outlook<'_>> = self.needing.iter().map(|k| self.keyframes[*k].outlook()).collect();
+        let is_needed = |group: &Group| needing.iter().any(|outlook| outlook.sees(&group.bounds));
+        let (seen, mut unseen): (Vec<Group>, Vec<Group>) = self.groups()?.into_par_iter().partition(is_needed);
+        let gaussians = |groups: &[Group], is_counted: &(dyn Fn(&Group) -> bool + Sync)| {
+            groups.par_iter().filter(|group| is_counted(group)).map(|group| group.places.len()).sum::<usize>()
+        };
+        let near = self.keyframes_near(self.needing[0]).into_iter().map(|k| self.keyframes[k].outlook());
+        let mut near: Vec<(usize, Outlook<'_>)> =
+            near.map(|outlook| (gaussians(&seen, &|group| outlook.sees(&group.bounds)), outlook)).collect();
+        near.sort_by_key(|(in_common, _)| std::cmp::Reverse(*in_common));
+        let mut kept = self.cloud.frozen() + gaussians(&seen, &|_| true);
+        for (_, outlook) in near {
+            kept += gaussians(&unseen, &|group| outlook.sees(&group.bounds));
+            if kept > room {
                 break;
             }
-            let mut is_seen = is_seen.into_iter();
-            unseen.retain(|_| is_seen.next() == Some(false));
+            unseen.retain(|group| !outlook.sees(&group.bounds));
         }
         Ok(unseen)
     }
@@ -140,7 +145,7 @@ impl Mapper {
         let first = self.cloud.frozen();
         let extents = self.cloud.extents(&self.gpu, first)?;
         let group = |part: Vec<usize>| Group {
-            ball: Ball::around(&part.iter().map(|i| extents[*i]).collect::<Vec<_>>()),
+            bounds: OrientedBox::around(&part.iter().map(|i| extents[*i]).collect::<Vec<_>>()),
             places: part.into_iter().map(|i| (first + i) as u32).collect(),
         };
         Ok(parts(&extents).into_iter().map(group).collect())

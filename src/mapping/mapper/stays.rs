@@ -112,7 +112,7 @@ impl Mapper {
         for k in keyframes {
             let outlook = self.keyframes[*k].outlook();
             for (group, is_counted) in groups.iter().zip(&mut here).filter(|(_, is_counted)| !**is_counted) {
-                *is_counted = outlook.sees(&group.ball);
+                *is_counted = outlook.sees(&group.bounds);
                 gaussians += if *is_counted { group.places.len() } else { 0 };
             }
             let new = self.chunks.seen_by(&outlook).into_iter().filter(|chunk| away.insert(*chunk));

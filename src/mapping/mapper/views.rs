@@ -1,19 +1,47 @@
 //! What steps learn from while a part of the map is away. A view leaves out the pixels in which something is seen that is away. Gaussians of which the
 //! views say too little are rendered, and stay as they are: steps from others would spoil what their own views taught.
 
+use std::collections::BTreeMap;
+
 use rayon::prelude::*;
 
 use super::Mapper;
 use super::paging::Group;
 use crate::mapping::MappingError;
-use crate::mapping::chunks::{Hidden, Outlook};
+use crate::mapping::chunks::{Hidden, OrientedBox, Outlook};
 
 /// Share of an image that steps learn from at least.
 const LEAST_SEEN: f32 = 0.5;
-/// Share of the keyframes near by that see a Gaussian from which steps can learn, at least, where the Gaussian is to be moved.
+/// Share of the pixels in which the keyframes near by see a Gaussian that steps learn from, at least, where the Gaussian is to be moved. Who comes into
+/// a room has more of them than all who saw it from afar: what these taught may change.
 const LEAST_LEARNABLE: f32 = 0.75;
 /// Keyframes near by that are looked at, so that the work for a keyframe does not grow with the map; image-only ones between them come on top.
 const NEAR: usize = 256;
+
+/// A keyframe near by.
+struct View<'a> {
+    outlook: Outlook<'a>,
+    /// Where it sees something that is away, if anywhere; none where steps do not learn from it at all.
+    hidden: Option<Option<Hidden>>,
+}
+
+impl View<'_> {
+    /// Whether steps learn from all pixels in which the view sees the box.
+    fn shows(&self, bounds: &OrientedBox) -> bool {
+        self.hidden.as_ref().is_some_and(|hidden| hidden.as_ref().is_none_or(|hidden| !self.outlook.is_hidden(bounds, hidden)))
+    }
+}
+
+/// Share of the pixels in which views show a box that steps learn from; all where none shows it.
+fn learnt_share<'a>(views: impl Iterator<Item = &'a View<'a>>, bounds: &OrientedBox) -> f32 {
+    let (mut seen, mut learnt) = (0.0, 0.0);
+    for view in views {
+        let pixels = view.outlook.share_of_pixels(bounds);
+        seen += pixels;
+        learnt += if pixels > 0.0 && view.shows(bounds) { pixels } else { 0.0 };
+    }
+    if seen > 0.0 { learnt / seen } else { 1.0 }
+}
 
 impl Mapper {
     /// Keyframes of these that steps can learn from.
@@ -58,8 +86,8 @@ impl Mapper {
         self.learnable = near.into_par_iter().filter(is_learnable).collect();
     }
 
-    /// Fixes the Gaussians on the GPU that steps would spoil: all but those of the window's keyframes, and those whose own keyframe can be learnt from and
-    /// most of those near by that see them.
+    /// Fixes the Gaussians on the GPU that steps would spoil. Free are those of which most of what the keyframes near by see can be learnt, and those of
+    /// the window's keyframes that show them whole.
     pub(super) fn fix_context(&mut self) -> Result<(), MappingError> {
         if self.chunks.are_here() {
             return self.fix(&[]);
@@ -67,32 +95,29 @@ impl Mapper {
         self.find_learnable();
         let mut near = self.keyframes_near(self.needing[0]);
         near.extend(self.learnable.iter().copied().filter(|k| !near.contains(k)).collect::<Vec<_>>());
-        let views: Vec<(bool, Outlook<'_>)> =
-            near.iter().map(|k| (self.is_learnable(*k), self.keyframes[*k].outlook())).collect();
-        let is_context = |group: &Group| {
-            let seeing: Vec<bool> = views.iter().filter(|(_, outlook)| outlook.sees(&group.ball)).map(|(is, _)| *is).collect();
-            let learnable = seeing.iter().filter(|is_learnable| **is_learnable).count();
-            (learnable as f32) < LEAST_LEARNABLE * seeing.len() as f32
-        };
+        let views: BTreeMap<usize, View<'_>> = near.par_iter().map(|k| (*k, self.view(*k))).collect();
         let groups = self.groups()?;
-        let context: Vec<bool> = groups.par_iter().map(is_context).collect();
-        let is_free = |place: u32, is_context: bool| {
-            let own = self.keyframes.binary_search_by_key(&self.anchors.keyframe(place), |keyframe| keyframe.id);
-            own.is_ok_and(|k| self.needing.contains(&k) || (self.is_learnable(k) && !is_context))
+        let fixed_of = |group: &Group| {
+            let is_context = learnt_share(views.values(), &group.bounds) < LEAST_LEARNABLE;
+            let is_free = |place: &u32| {
+                let own = self.keyframes.binary_search_by_key(&self.anchors.keyframe(*place), |keyframe| keyframe.id);
+                !is_context
+                    || own.is_ok_and(|k| self.needing.contains(&k) && views.get(&k).is_some_and(|view| view.shows(&group.bounds)))
+            };
+            group.places.iter().copied().filter(|place| !is_free(place)).collect::<Vec<u32>>()
         };
-        let places =
-            groups.iter().zip(context).flat_map(|(group, is_context)| group.places.iter().map(move |p| (*p, is_context)));
-        let mut fixed: Vec<u32> =
-            places.filter(|(place, is_context)| !is_free(*place, *is_context)).map(|(place, _)| place).collect();
+        let mut fixed: Vec<u32> = groups.par_iter().flat_map_iter(fixed_of).collect();
         fixed.sort_unstable();
-        tracing::debug!(
-            learnable = self.learnable.len(),
-            near = near.len(),
-            fixed = fixed.len(),
-            resident = self.cloud.len(),
-            "context"
-        );
+        let (learnable, resident) = (self.learnable.len(), self.cloud.len());
+        tracing::debug!(learnable, near = near.len(), fixed = fixed.len(), resident, "context");
         self.fix(&fixed)
+    }
+
+    /// What steps can learn from a keyframe.
+    fn view(&self, k: usize) -> View<'_> {
+        let outlook = self.keyframes[k].outlook();
+        let hidden = self.is_learnable(k).then(|| self.chunks.hidden_from(&outlook));
+        View { outlook, hidden }
     }
 
     /// No step moves the Gaussians at these places from now on, and only these.
@@ -102,5 +127,41 @@ impl Mapper {
             self.anchors.fix(places);
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::Vec3;
+    use image::RgbImage;
+
+    use super::*;
+    use crate::geometry::{Pinhole, Se3};
+    use crate::mapping::chunks::Sight;
+    use crate::sequence::RectifiedImage;
+    use crate::splat::ViewCamera;
+
+    fn cube(x: f32, z: f32, half: f32) -> OrientedBox {
+        OrientedBox::new(Vec3::new(x, 0.0, z), [half * Vec3::X, half * Vec3::Y, half * Vec3::Z])
+    }
+
+    #[test]
+    fn the_nearest_views_decide_and_only_where_they_are_whole() {
+        let pinhole = Pinhole { fx: 64.0, fy: 64.0, cx: 31.5, cy: 23.5, width: 64, height: 48 };
+        let sight = Sight::of(&RectifiedImage { pinhole, color: RgbImage::new(64, 48), depth: None, valid: None });
+        let outlook = |z: f64| sight.from(&ViewCamera { pinhole, camera_from_world: Se3::translation(0.0, 0.0, -z) });
+        let beside = |z: f64, x: f32| {
+            let mut hidden = outlook(z).nothing_hidden();
+            outlook(z).hide(&cube(x, 19.0, 0.2), &mut hidden);
+            View { outlook: outlook(z), hidden: Some(Some(hidden)) }
+        };
+        let far = || View { outlook: outlook(0.0), hidden: None };
+        let near = || View { outlook: outlook(18.0), hidden: Some(None) };
+        let share = |views: &[View<'_>]| learnt_share(views.iter(), &cube(0.0, 20.0, 0.1));
+        assert!(share(&[far(), far(), far(), near()]) > LEAST_LEARNABLE);
+        assert!(share(&[far(), View { outlook: outlook(2.0), hidden: Some(None) }]) < LEAST_LEARNABLE);
+        assert_eq!((share(&[far()]), share(&[])), (0.0, 1.0));
+        // What is away stands in the way of one of two, and beside the other.
+        assert!((share(&[beside(18.0, 0.0), beside(18.0, 0.6)]) - 0.5).abs() < 1e-3);
     }
 }

@@ -1,7 +1,7 @@
 //! Gaussians off the GPU with all that training knows of them: how a map larger than the GPU's memory is kept, and how training goes on elsewhere.
 
 use bytemuck::Zeroable;
-use glam::Vec3;
+use glam::{Mat3, Quat, Vec3};
 use serde::{Deserialize, Serialize};
 
 use super::change::Gathering;
@@ -16,6 +16,28 @@ use crate::splat::{GaussianCloud, ShDegree};
 const PARAMETERS: usize = 0;
 const MOMENTS_2: usize = 2;
 const AVERAGES: usize = 3;
+
+/// Where a Gaussian lies and how far it reaches.
+#[derive(Clone, Copy, Debug)]
+pub struct Extent {
+    /// Its centre, in world coordinates, metres.
+    pub mean: Vec3,
+    /// The half axes of its ellipsoid of one standard deviation, in the world's frame, metres.
+    pub axes: [Vec3; 3],
+}
+
+impl Extent {
+    /// Of a Gaussian with these standard deviations, metres, along its own axes.
+    pub fn new(mean: Vec3, deviations: Vec3, world_from_own: Quat) -> Self {
+        let axes = Mat3::from_quat(world_from_own) * Mat3::from_diagonal(deviations);
+        Self { mean, axes: [axes.x_axis, axes.y_axis, axes.z_axis] }
+    }
+
+    /// Its standard deviation along a unit vector, metres.
+    pub fn deviation(&self, along: Vec3) -> f32 {
+        self.axes.iter().map(|axis| axis.dot(along).powi(2)).sum::<f32>().sqrt()
+    }
+}
 
 /// Gaussians with their moments, averages and histories.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -89,10 +111,10 @@ impl CloudPart {
         Some(Self { values, histories })
     }
 
-    /// Centres and largest standard deviations, metres, as training has them.
-    pub fn extents(&self) -> Vec<(Vec3, f32)> {
+    /// Where they lie and how far they reach, as training has them.
+    pub fn extents(&self) -> Vec<Extent> {
         let count = self.len();
-        (0..count).map(|i| extent(&self.values[i], &self.values[count + i])).collect()
+        extents([0, 1, 2].map(|plane| &self.values[plane * count..][..count]))
     }
 
     /// The Gaussians as they are shown, see [`GpuCloud::download`].
@@ -160,15 +182,15 @@ impl GpuCloud {
         Ok(part)
     }
 
-    /// Centres and largest standard deviations of the Gaussians from the place `first` on, metres, as training has them.
+    /// Where the Gaussians from the place `first` on lie and how far they reach, as training has them.
     ///
     /// # Errors
     /// [`GpuError`] if the device fails.
-    pub fn extents(&self, gpu: &Gpu, first: usize) -> Result<Vec<(Vec3, f32)>, GpuError> {
+    pub fn extents(&self, gpu: &Gpu, first: usize) -> Result<Vec<Extent>, GpuError> {
         let plane = |plane: usize| self.parameters.part::<[f32; 4]>(plane * self.capacity + first, self.count - first);
-        let read = gpu.read(None, &[plane(0), plane(1)])?;
-        let (positions, scales) = (read.part::<[f32; 4]>(0), read.part::<[f32; 4]>(1));
-        Ok(positions.iter().zip(&scales).map(|(position, scale)| extent(position, scale)).collect())
+        let read = gpu.read(None, &[plane(0), plane(1), plane(2)])?;
+        let planes: [Vec<[f32; 4]>; 3] = [0, 1, 2].map(|i| read.part(i));
+        Ok(extents(planes.each_ref().map(Vec::as_slice)))
     }
 
     /// Appends Gaussians that were here before, as they were.
@@ -193,8 +215,14 @@ impl GpuCloud {
     }
 }
 
-fn extent(position: &[f32; 4], scale: &[f32; 4]) -> (Vec3, f32) {
-    (Vec3::new(position[0], position[1], position[2]), scale[0].max(scale[1]).max(scale[2]).exp())
+/// Of parameters by plane.
+fn extents([positions, scales, rotations]: [&[[f32; 4]]; 3]) -> Vec<Extent> {
+    let extent = |((position, scale), rotation): ((&[f32; 4], &[f32; 4]), &[f32; 4])| {
+        let [w, x, y, z] = *rotation;
+        let scale = Vec3::from_slice(scale).exp();
+        Extent::new(Vec3::from_slice(position), scale, Quat::from_xyzw(x, y, z, w).normalize())
+    };
+    positions.iter().zip(scales).zip(rotations).map(extent).collect()
 }
 
 /// A map as it is shown, of the planes of its averages, `[planes][N]`.
