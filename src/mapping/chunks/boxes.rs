@@ -23,6 +23,11 @@ impl OrientedBox {
         Self([center.to_array(), first, second, third])
     }
 
+    #[cfg(test)]
+    pub fn cube(center: Vec3, half: f32) -> Self {
+        Self::new(center, [half * Vec3::X, half * Vec3::Y, half * Vec3::Z])
+    }
+
     pub fn center(&self) -> Vec3 {
         self.0[0].into()
     }

@@ -90,10 +90,6 @@ mod tests {
     use crate::sequence::{DepthImage, RectifiedImage};
     use crate::splat::ViewCamera;
 
-    fn cube(center: Vec3, half: f32) -> OrientedBox {
-        OrientedBox::new(center, [half * Vec3::X, half * Vec3::Y, half * Vec3::Z])
-    }
-
     proptest! {
         #[test]
         fn the_index_finds_what_a_look_at_each_finds(
@@ -108,7 +104,7 @@ mod tests {
             let sight = Sight::of(&image);
             let outlook = sight.from(&ViewCamera { pinhole, camera_from_world });
             let mut chunks: BTreeMap<ChunkId, OrientedBox> =
-                (0..).zip(boxes).map(|(id, [x, y, z, r])| (id, cube(Vec3::new(x, y, z), r.abs() / 8.0))).collect();
+                (0..).zip(boxes).map(|(id, [x, y, z, r])| (id, OrientedBox::cube(Vec3::new(x, y, z), r.abs() / 8.0))).collect();
             let mut index: Index = chunks.iter().map(|(id, bounds)| (*id, bounds)).collect();
             for which in removed {
                 let id = which.index(100) as ChunkId;

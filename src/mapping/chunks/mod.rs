@@ -1,6 +1,6 @@
 //! Out-of-core mapping: Gaussians that no keyframe near by sees leave the GPU for the disk, and come back when one does, as in DiskChunGS.
 //!
-//! A chunk is a few dozen neighbours, divided anew each time Gaussians leave. A box around it says which keyframes see it.
+//! A chunk is up to 16 neighbours, divided anew each time Gaussians leave. A box around it says which keyframes see it.
 
 mod boxes;
 mod index;

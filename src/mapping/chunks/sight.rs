@@ -100,7 +100,9 @@ impl Outlook<'_> {
 
     /// Goes through the blocks in which the box is seen until `found` ends that; returns whether it did.
     fn reaches(&self, bounds: &OrientedBox, mut found: impl FnMut(usize) -> bool) -> bool {
-        let Some(InView { center, half_axes, nearest }) = self.in_view(bounds) else { return false };
+        let Some(in_view) = self.in_view(bounds) else { return false };
+        let (center, half_axes) = (in_view.center(), in_view.half_axes());
+        let nearest = center.z - in_view.reach(Vec3::Z);
         let (columns, rows) = (self.sight.columns, self.sight.farthest.len() as u32 / self.sight.columns);
         if nearest < NEAR_METRES as f32 {
             // It surrounds the camera, or reaches through the image's plane: its outline says nothing.
@@ -135,9 +137,9 @@ impl Outlook<'_> {
         self.in_view(bounds).is_some()
     }
 
-    /// In how many pixels the view shows what lies in the middle of the box, compared with other views of it: the inverse square of its distance. None
-    /// where the middle is not in the image, or behind what the image shows there.
-    pub fn share_of_pixels(&self, bounds: &OrientedBox) -> f32 {
+    /// Pixels in which the view shows a surface in the middle of the box, compared with other views: the inverse square of the distance. Zero where the
+    /// middle is not in the image, or behind what the image shows there.
+    pub fn pixel_density(&self, bounds: &OrientedBox) -> f32 {
         let center = self.turned(bounds.center()) + Vec3::from(self.translation);
         if center.z < NEAR_METRES as f32 {
             return 0.0;
@@ -159,13 +161,11 @@ impl Outlook<'_> {
     }
 
     /// The box in the camera's frame; none if it does not reach into the pyramid of the view, or lies behind all that the view shows.
-    fn in_view(&self, bounds: &OrientedBox) -> Option<InView> {
+    fn in_view(&self, bounds: &OrientedBox) -> Option<OrientedBox> {
         let center = self.turned(bounds.center()) + Vec3::from(self.translation);
-        let half_axes = bounds.half_axes().map(|axis| self.turned(axis));
-        let reach = |normal: Vec3| half_axes.iter().map(|axis| axis.dot(normal).abs()).sum::<f32>();
-        let depth_reach = reach(Vec3::Z);
-        let nearest = center.z - depth_reach;
-        if center.z + depth_reach < NEAR_METRES as f32 || nearest > self.most * DEPTH_MARGIN {
+        let in_camera = OrientedBox::new(center, bounds.half_axes().map(|axis| self.turned(axis)));
+        let depth_reach = in_camera.reach(Vec3::Z);
+        if center.z + depth_reach < NEAR_METRES as f32 || center.z - depth_reach > self.most * DEPTH_MARGIN {
             return None;
         }
         let (columns, rows) = (self.sight.columns, self.sight.farthest.len() as u32 / self.sight.columns);
@@ -177,24 +177,16 @@ impl Outlook<'_> {
                 let mut normal = Vec3::new(0.0, 0.0, -slope);
                 normal[axis] = 1.0;
                 let normal = inwards * normal / (1.0 + slope * slope).sqrt();
-                normal.dot(center) > -reach(normal)
+                normal.dot(center) > -in_camera.reach(normal)
             })
         };
         let Pinhole { fx, fy, cx, cy, .. } = self.pinhole;
-        (is_inside(0, fx, cx, columns) && is_inside(1, fy, cy, rows)).then_some(InView { center, half_axes, nearest })
+        (is_inside(0, fx, cx, columns) && is_inside(1, fy, cy, rows)).then_some(in_camera)
     }
 
     fn turned(&self, v: Vec3) -> Vec3 {
         Vec3::from(self.axes.map(|axis| axis.dot(v)))
     }
-}
-
-/// A box in the camera's frame, metres.
-struct InView {
-    center: Vec3,
-    half_axes: [Vec3; 3],
-    /// Depth of its nearest corner.
-    nearest: f32,
 }
 
 /// Blocks of an image that show something that is away.
@@ -245,7 +237,7 @@ mod tests {
     }
 
     fn cube(x: f32, y: f32, z: f32, half: f32) -> OrientedBox {
-        OrientedBox::new(Vec3::new(x, y, z), [half * Vec3::X, half * Vec3::Y, half * Vec3::Z])
+        OrientedBox::cube(Vec3::new(x, y, z), half)
     }
 
     #[test]
@@ -278,7 +270,7 @@ mod tests {
     fn near_views_have_more_pixels_of_it_and_walls_leave_none() {
         let (sight, camera) = sight();
         let outlook = sight.from(&camera);
-        let pixels = |x: f32, z: f32| outlook.share_of_pixels(&cube(x, 0.0, z, 0.3));
+        let pixels = |x: f32, z: f32| outlook.pixel_density(&cube(x, 0.0, z, 0.3));
         assert!((pixels(0.4, 4.0) / pixels(0.8, 8.0) - 4.0).abs() < 1e-4);
         assert!(pixels(-0.5, 2.0) > 0.0 && pixels(-0.5, 2.1) == 0.0);
         assert_eq!([pixels(0.0, -1.0), pixels(3.0, 2.0), pixels(0.5, 9.5)], [0.0; 3]);

@@ -90,8 +90,8 @@ impl Mapper {
         self.page_out(&leaving)
     }
 
-    /// Groups on the GPU that neither a needing keyframe sees, nor one near the first of these: as many have room for what they see, those first that see
-    /// most of what the needing ones see.
+    /// Groups on the GPU that neither a needing keyframe sees, nor one near the first of these. Those near by count in the order of what they have in
+    /// common with the needing ones, as long as there is room.
     fn unseen(&self, room: usize) -> Result<Vec<Group>, MappingError> {
         let needing: Vec<Outlook<'_>> = self.needing.iter().map(|k| self.keyframes[*k].outlook()).collect();
         let is_needed = |group: &Group| needing.iter().any(|outlook| outlook.sees(&group.bounds));

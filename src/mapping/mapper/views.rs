@@ -1,7 +1,7 @@
 //! What steps learn from while a part of the map is away. A view leaves out the pixels in which something is seen that is away. Gaussians of which the
 //! views say too little are rendered, and stay as they are: steps from others would spoil what their own views taught.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use rayon::prelude::*;
 
@@ -12,8 +12,8 @@ use crate::mapping::chunks::{Hidden, OrientedBox, Outlook};
 
 /// Share of an image that steps learn from at least.
 const LEAST_SEEN: f32 = 0.5;
-/// Share of the pixels in which the keyframes near by see a Gaussian that steps learn from, at least, where the Gaussian is to be moved. Who comes into
-/// a room has more of them than all who saw it from afar: what these taught may change.
+/// Share of the pixels in which the keyframes near by see a Gaussian that steps learn from, at least, where the Gaussian is to be moved. Few near views
+/// have more of them than many distant ones.
 const LEAST_LEARNABLE: f32 = 0.75;
 /// Keyframes near by that are looked at, so that the work for a keyframe does not grow with the map; image-only ones between them come on top.
 const NEAR: usize = 256;
@@ -21,14 +21,15 @@ const NEAR: usize = 256;
 /// A keyframe near by.
 struct View<'a> {
     outlook: Outlook<'a>,
-    /// Where it sees something that is away, if anywhere; none where steps do not learn from it at all.
-    hidden: Option<Option<Hidden>>,
+    is_learnable: bool,
+    /// Where it sees something that is away, if anywhere; unknown where steps do not learn from it.
+    hidden: Option<Hidden>,
 }
 
 impl View<'_> {
     /// Whether steps learn from all pixels in which the view sees the box.
     fn shows(&self, bounds: &OrientedBox) -> bool {
-        self.hidden.as_ref().is_some_and(|hidden| hidden.as_ref().is_none_or(|hidden| !self.outlook.is_hidden(bounds, hidden)))
+        self.is_learnable && self.hidden.as_ref().is_none_or(|hidden| !self.outlook.is_hidden(bounds, hidden))
     }
 }
 
@@ -36,7 +37,7 @@ impl View<'_> {
 fn learnt_share<'a>(views: impl Iterator<Item = &'a View<'a>>, bounds: &OrientedBox) -> f32 {
     let (mut seen, mut learnt) = (0.0, 0.0);
     for view in views {
-        let pixels = view.outlook.share_of_pixels(bounds);
+        let pixels = view.outlook.pixel_density(bounds);
         seen += pixels;
         learnt += if pixels > 0.0 && view.shows(bounds) { pixels } else { 0.0 };
     }
@@ -93,8 +94,8 @@ impl Mapper {
             return self.fix(&[]);
         }
         self.find_learnable();
-        let mut near = self.keyframes_near(self.needing[0]);
-        near.extend(self.learnable.iter().copied().filter(|k| !near.contains(k)).collect::<Vec<_>>());
+        let near = self.keyframes_near(self.needing[0]);
+        let near: BTreeSet<usize> = near.iter().chain(&self.learnable).copied().collect();
         let views: BTreeMap<usize, View<'_>> = near.par_iter().map(|k| (*k, self.view(*k))).collect();
         let groups = self.groups()?;
         let fixed_of = |group: &Group| {
@@ -116,8 +117,9 @@ impl Mapper {
     /// What steps can learn from a keyframe.
     fn view(&self, k: usize) -> View<'_> {
         let outlook = self.keyframes[k].outlook();
-        let hidden = self.is_learnable(k).then(|| self.chunks.hidden_from(&outlook));
-        View { outlook, hidden }
+        let is_learnable = self.is_learnable(k);
+        let hidden = if is_learnable { self.chunks.hidden_from(&outlook) } else { None };
+        View { outlook, is_learnable, hidden }
     }
 
     /// No step moves the Gaussians at these places from now on, and only these.
@@ -142,7 +144,7 @@ mod tests {
     use crate::splat::ViewCamera;
 
     fn cube(x: f32, z: f32, half: f32) -> OrientedBox {
-        OrientedBox::new(Vec3::new(x, 0.0, z), [half * Vec3::X, half * Vec3::Y, half * Vec3::Z])
+        OrientedBox::cube(Vec3::new(x, 0.0, z), half)
     }
 
     #[test]
@@ -153,13 +155,13 @@ mod tests {
         let beside = |z: f64, x: f32| {
             let mut hidden = outlook(z).nothing_hidden();
             outlook(z).hide(&cube(x, 19.0, 0.2), &mut hidden);
-            View { outlook: outlook(z), hidden: Some(Some(hidden)) }
+            View { outlook: outlook(z), is_learnable: true, hidden: Some(hidden) }
         };
-        let far = || View { outlook: outlook(0.0), hidden: None };
-        let near = || View { outlook: outlook(18.0), hidden: Some(None) };
+        let view = |z: f64, is_learnable: bool| View { outlook: outlook(z), is_learnable, hidden: None };
+        let (far, near) = (|| view(0.0, false), || view(18.0, true));
         let share = |views: &[View<'_>]| learnt_share(views.iter(), &cube(0.0, 20.0, 0.1));
         assert!(share(&[far(), far(), far(), near()]) > LEAST_LEARNABLE);
-        assert!(share(&[far(), View { outlook: outlook(2.0), hidden: Some(None) }]) < LEAST_LEARNABLE);
+        assert!(share(&[far(), view(2.0, true)]) < LEAST_LEARNABLE);
         assert_eq!((share(&[far()]), share(&[])), (0.0, 1.0));
         // What is away stands in the way of one of two, and beside the other.
         assert!((share(&[beside(18.0, 0.0), beside(18.0, 0.6)]) - 0.5).abs() < 1e-3);
