@@ -1,8 +1,9 @@
 //! A building of rooms: their grid, the order in which a walk enters them, and the walls, floors and doorways between them.
 //!
-//! Rooms are numbered along a serpentine through the grid, and doorways join consecutive ones only: the building is a chain. So
-//! what can be seen or lit from a room lies along the chain. World: origin in a corner of room 0, z up, metres.
+//! Rooms are numbered along a serpentine through the grid, and doorways join consecutive ones. Where the walk returns, a doorway
+//! also joins the last room of a row and the first of the row before. World: origin in a corner of room 0, z up, metres.
 
+use std::collections::BTreeSet;
 use std::ops::Range;
 
 use fastrand::Rng;
@@ -28,14 +29,26 @@ const MARGIN: f64 = 0.5;
 pub struct Doorway {
     pub low: DVec3,
     pub high: DVec3,
-    /// Unit vector out of the room that the walk leaves.
-    pub ahead: DVec3,
+    /// The rooms that it joins.
+    rooms: [usize; 2],
+    /// Unit vector out of the first of them.
+    ahead: DVec3,
 }
 
 impl Doorway {
     /// Its middle on the floor.
     pub fn middle(&self) -> DVec3 {
         ((self.low + self.high) * 0.5).with_z(0.0)
+    }
+
+    /// Unit vector through it, out of a room.
+    pub fn out_of(&self, room: usize) -> DVec3 {
+        if room == self.rooms[0] { self.ahead } else { -self.ahead }
+    }
+
+    /// The room on the other side; `None` if it is not one of `room`.
+    fn beyond(&self, room: usize) -> Option<usize> {
+        self.rooms.contains(&room).then(|| self.rooms[0] + self.rooms[1] - room)
     }
 }
 
@@ -45,18 +58,38 @@ pub struct FloorPlan {
     grid: [usize; 2],
     /// Inner size of each room.
     pub room: DVec3,
-    /// Doorway `k` leads from room `k` to `k + 1`.
     pub doors: Vec<Doorway>,
+    /// Rooms in the order in which a walk enters them.
+    pub way: Vec<usize>,
 }
 
 impl FloorPlan {
     pub fn new(config: &SceneConfig) -> Self {
         let r = &config.room;
-        let mut plan = Self { grid: r.rooms, room: dvec3(r.width, r.depth, r.height), doors: Vec::new() };
+        let mut plan = Self { grid: r.rooms, room: dvec3(r.width, r.depth, r.height), doors: Vec::new(), way: Vec::new() };
         let mut rng = Rng::with_seed(config.seed ^ 0xD005);
-        plan.doors =
-            (1..plan.rooms()).map(|k| plan.doorway(k - 1, DOOR_PLACE.0 + (DOOR_PLACE.1 - DOOR_PLACE.0) * rng.f64())).collect();
+        let along = (1..plan.rooms()).map(|k| [k - 1, k]);
+        let mut doorway = |rooms| plan.doorway(rooms, DOOR_PLACE.0 + (DOOR_PLACE.1 - DOOR_PLACE.0) * rng.f64());
+        let mut doors: Vec<Doorway> = along.map(&mut doorway).collect();
+        let returns = plan.returns(config.path.returns);
+        doors.extend(returns.iter().copied().map(&mut doorway));
+        plan.doors = doors;
+        for room in 0..plan.rooms() {
+            plan.way.push(room);
+            plan.way.extend(returns.iter().filter(|[last, _]| *last == room).flat_map(|[last, first]| [*first, *last]));
+        }
         plan
+    }
+
+    /// The last room of each row but the first, and the first of the row before, where the walk returns.
+    fn returns(&self, returns: bool) -> Vec<[usize; 2]> {
+        let [columns, rows] = self.grid;
+        (1..rows).filter(|_| returns).map(|row| [(row + 1) * columns - 1, (row - 1) * columns]).collect()
+    }
+
+    /// The doorway between two rooms.
+    pub fn door(&self, a: usize, b: usize) -> Option<&Doorway> {
+        self.doors.iter().find(|door| door.beyond(a) == Some(b))
     }
 
     pub fn rooms(&self) -> usize {
@@ -90,12 +123,12 @@ impl FloorPlan {
 
     /// Whether light of one room falls into the other.
     pub fn joined(&self, a: usize, b: usize) -> bool {
-        a.abs_diff(b) <= 1
+        a == b || self.door(a, b).is_some()
     }
 
-    /// The doorway out of room `k`, with its middle at a share of the wall.
-    fn doorway(&self, k: usize, share: f64) -> Doorway {
-        let (here, next) = (self.corner(k), self.corner(k + 1));
+    /// The doorway between two neighbours, with its middle at a share of the wall.
+    fn doorway(&self, rooms: [usize; 2], share: f64) -> Doorway {
+        let [here, next] = rooms.map(|room| self.corner(room));
         let ahead = (next - here).normalize();
         let axis = usize::from(ahead.x.abs() < 0.5);
         let (across, from) = (1 - axis, here.max(next));
@@ -103,13 +136,13 @@ impl FloorPlan {
         low[axis] -= WALL;
         (low[across], high[across]) =
             (from[across] + self.room[across] * share - DOOR.0 * 0.5, from[across] + self.room[across] * share + DOOR.0 * 0.5);
-        Doorway { low, high: high.with_z(DOOR.1), ahead }
+        Doorway { low, high: high.with_z(DOOR.1), rooms, ahead }
     }
 
     /// Boxes before a room's doorways where no furniture may stand, from the room's corner.
     pub fn aisles(&self, room: usize) -> Vec<(DVec3, DVec3)> {
-        let doors = self.doors.iter().enumerate().filter(|(k, _)| *k == room || *k + 1 == room);
-        let aisle = |(_, door): (usize, &Doorway)| {
+        let doors = self.doors.iter().filter(|door| door.rooms.contains(&room));
+        let aisle = |door: &Doorway| {
             let reach = door.ahead.abs() * AISLE;
             (door.low - reach - self.corner(room), door.high + reach - self.corner(room))
         };
@@ -117,22 +150,29 @@ impl FloorPlan {
     }
 
     /// Rooms of which a camera may see something: those whose doorways lie behind each other in its picture.
-    pub fn seen_from(&self, origin: DVec3, world_from_camera: &DMat3) -> Range<usize> {
-        let here = self.room_at(origin);
-        let mut seen = here..here + 1;
+    pub fn seen_from(&self, origin: DVec3, world_from_camera: &DMat3) -> BTreeSet<usize> {
         let outline = |door: &Doorway| {
             let (middle, half) = ((door.low + door.high) * 0.5 - origin, (door.high - door.low) * 0.5);
             Outline::of_box(world_from_camera.transpose() * middle, &world_from_camera.transpose(), half)
         };
-        let mut gap = Outline::everything();
-        while seen.end < self.rooms() && gap.narrow(&outline(&self.doors[seen.end - 1])) {
-            seen.end += 1;
-        }
-        gap = Outline::everything();
-        while seen.start > 0 && gap.narrow(&outline(&self.doors[seen.start - 1])) {
-            seen.start -= 1;
-        }
+        let mut seen = BTreeSet::new();
+        self.look(&mut vec![self.room_at(origin)], Outline::everything(), &outline, &mut seen);
         seen
+    }
+
+    /// Adds the last of the `rooms` that a line of sight has passed, and those seen beyond it through a gap. No line enters a room twice.
+    fn look(&self, rooms: &mut Vec<usize>, gap: Outline, outline: &impl Fn(&Doorway) -> Outline, seen: &mut BTreeSet<usize>) {
+        let here = rooms[rooms.len() - 1];
+        seen.insert(here);
+        for door in &self.doors {
+            let Some(next) = door.beyond(here).filter(|next| !rooms.contains(next)) else { continue };
+            let mut narrower = gap;
+            if narrower.narrow(&outline(door)) {
+                rooms.push(next);
+                self.look(rooms, narrower, outline, seen);
+                rooms.pop();
+            }
+        }
     }
 }
 
@@ -155,8 +195,8 @@ impl Rooms {
     }
 
     /// The solids of some rooms, in the scene's order.
-    pub fn solids(&self, rooms: Range<usize>) -> Vec<u32> {
-        let mut all = self.solids[rooms.clone()].concat();
+    pub fn solids(&self, rooms: &BTreeSet<usize>) -> Vec<u32> {
+        let mut all: Vec<u32> = rooms.iter().flat_map(|room| &self.solids[*room]).copied().collect();
         if rooms.len() > 1 {
             all.sort_unstable();
             all.dedup();
@@ -166,8 +206,9 @@ impl Rooms {
 
     /// The solids of a point's room and of those joined to it.
     pub fn solids_near(&self, p: DVec3) -> impl Iterator<Item = usize> + '_ {
-        let room = self.plan.room_at(p);
-        self.solids[room.saturating_sub(1)..(room + 2).min(self.solids.len())].iter().flatten().map(|k| *k as usize)
+        let here = self.plan.room_at(p);
+        let near = self.solids.iter().enumerate().filter(move |(room, _)| self.plan.joined(here, *room));
+        near.flat_map(|(_, of_room)| of_room).map(|k| *k as usize)
     }
 
     /// Walls, floors and ceilings of a building, and the shell around it, which nobody sees and is solid 0.
@@ -189,7 +230,7 @@ impl Rooms {
         for wall in plan.walls() {
             let first = masonry.solids.len();
             let door = match wall.sides {
-                [Some(a), Some(b)] if a.abs_diff(b) == 1 => Some(&plan.doors[a.min(b)]),
+                [Some(a), Some(b)] => plan.door(a, b),
                 _ => None,
             };
             masonry.wall(&wall, door);

@@ -35,20 +35,44 @@ fn cell(config: &SceneConfig, p: DVec3) -> Option<(usize, usize)> {
     Some((along(p.x, config.room.width, config.room.rooms[0])?, along(p.y, config.room.depth, config.room.rooms[1])?))
 }
 
-#[test]
-fn a_walk_visits_each_room_in_turn_and_touches_nothing() {
-    let config = building();
-    let plan = Plan::new(&config).unwrap();
+/// Cells in the order in which a walk enters them; it touches nothing.
+fn visited(config: &SceneConfig) -> Vec<(usize, usize)> {
+    let plan = Plan::new(config).unwrap();
     let mut visited = Vec::new();
     for frame in 0..config.frames {
         let p = position(&plan.path.world_from_camera(frame as f64 / config.fps));
         let nearest = plan.solids.iter().map(|solid| solid.distance(p)).fold(f64::INFINITY, f64::min);
         assert!(nearest >= MIN_CLEARANCE, "frame {frame}: {nearest} m");
-        if let Some(cell) = cell(&config, p).filter(|cell| visited.last() != Some(cell)) {
+        if let Some(cell) = cell(config, p).filter(|cell| visited.last() != Some(cell)) {
             visited.push(cell);
         }
     }
-    assert_eq!(visited, [(0, 0), (1, 0), (1, 1), (0, 1)]);
+    visited
+}
+
+#[test]
+fn a_walk_visits_each_room_in_turn() {
+    assert_eq!(visited(&building()), [(0, 0), (1, 0), (1, 1), (0, 1)]);
+}
+
+#[test]
+fn a_walk_that_returns_goes_back_to_where_the_row_before_began() {
+    let mut config = SceneConfig { frames: 1300, ..building() };
+    (config.path.returns, config.room.rooms) = (true, [2, 3]);
+    let chain = [(0, 0), (1, 0), (1, 1), (0, 1)];
+    assert_eq!(visited(&config), [&chain[..], &[(0, 0), (0, 1), (0, 2), (1, 2), (1, 1), (1, 2)]].concat());
+    // It sees the rooms beyond the further doorways, too.
+    let rooms = Plan::new(&config).unwrap().rooms;
+    let looking = |room: usize, from: DVec3, to: DVec3| {
+        let ahead = (to - from).normalize();
+        let right = ahead.cross(DVec3::Z).normalize();
+        rooms.plan.seen_from(from, &glam::DMat3::from_cols(right, ahead.cross(right), ahead)).contains(&room)
+    };
+    let door = rooms.plan.door(3, 0).unwrap().middle() + DVec3::Z;
+    let out = rooms.plan.door(3, 0).unwrap().out_of(3);
+    assert!(looking(0, door - out * 2.0, door) && looking(3, door + out * 2.0, door));
+    assert!(!looking(0, door - out * 2.0, door - out * 3.0) && !looking(5, door - out * 2.0, door));
+    assert!(rooms.plan.joined(0, 3) && !rooms.plan.joined(0, 2) && !rooms.plan.joined(1, 4));
 }
 
 #[test]
@@ -116,7 +140,7 @@ fn rooms_differ_and_are_lit() {
     let plan = Plan::new(&config).unwrap();
     let (rooms, mut looks) = (&plan.rooms, std::collections::BTreeSet::new());
     for room in 0..4 {
-        let own = rooms.solids(room..room + 1);
+        let own = rooms.solids(&[room].into());
         assert!(own.len() > 50);
         looks.insert(own.iter().map(|k| plan.solids[*k as usize].seed).collect::<Vec<_>>());
     }
@@ -154,6 +178,7 @@ fn bad_buildings_are_refused_with_the_field_and_what_to_do() {
     assert!(error(|c| c.room.rooms = [0, 3]).contains("`room.rooms` is [0, 3]"));
     assert!(error(|c| c.room.rooms = [usize::MAX, 2]).contains("1 to 100 in all"));
     assert!(error(|c| c.path.kind = PathKind::Loop).contains("`path.kind` must be \"walk\""));
+    assert!(error(|c| (c.path.returns, c.room.rooms) = (true, [1, 4])).contains("`path.returns` must be false"));
     assert!(error(|c| c.furniture.windows = 1).contains("`furniture.windows` must be 0"));
     assert!(error(|c| c.degradation.moving_object = true).contains("`degradation.moving_object` must be false"));
     assert!(error(|c| (c.room.rooms, c.furniture.pictures) = ([10, 10], 60)).contains("between 0 and 40"));

@@ -104,7 +104,7 @@ pub struct RoomConfig {
     pub depth: f64,
     /// Floor to ceiling.
     pub height: f64,
-    /// Rooms along x and along y, all of the size above; doorways join them in one chain. More than one need a path of kind `walk`.
+    /// Rooms along x and along y, all of the size above; doorways join them in one chain, and more where `path.returns`. More than one need a path of kind `walk`.
     #[serde(skip_serializing_if = "is_one_room")]
     pub rooms: [usize; 2],
     /// 0 for purely diffuse surfaces, whose look does not depend on where one stands; up to 1 for highlights on wood, glaze, metal.
@@ -182,6 +182,9 @@ pub struct PathConfig {
     pub kind: PathKind,
     /// Times round the room, for a loop; the last frame is back at the start.
     pub rounds: u32,
+    /// Whether a walk goes back, at the end of each row of rooms, through a further doorway into the room in which the row before began.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub returns: bool,
     /// The most that the path itself, without the hand's shake, moves, m/s. A sweep goes at the pace that this and the turning
     /// rate allow together; other paths take as long as there are frames.
     pub speed: f64,
@@ -198,7 +201,16 @@ pub struct PathConfig {
 impl Default for PathConfig {
     fn default() -> Self {
         let kind = PathKind::Sweep;
-        Self { kind, rounds: 1, speed: 0.4, turn_rate: 28.0, height: 1.35, shake_metres: 0.01, shake_degrees: 1.0 }
+        Self {
+            kind,
+            rounds: 1,
+            returns: false,
+            speed: 0.4,
+            turn_rate: 28.0,
+            height: 1.35,
+            shake_metres: 0.01,
+            shake_degrees: 1.0,
+        }
     }
 }
 
@@ -271,6 +283,9 @@ impl SceneConfig {
             return Err(SceneError::Field { field: "room.rooms", what });
         }
         let refused = |field, what: &str| Err(SceneError::Field { field, what: what.into() });
+        if self.path.returns && (columns < 2 || rows < 2) {
+            return refused("path.returns", "must be false unless `room.rooms` has two rooms or more along x and along y");
+        }
         if is_one_room(&self.room.rooms) {
             Ok(())
         } else if self.path.kind != PathKind::Walk {

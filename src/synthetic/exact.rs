@@ -50,7 +50,7 @@ fn by_room(plan: &Plan) -> Vec<Vec<Se3>> {
     let rooms = &plan.rooms.plan;
     let mut poses = vec![Vec::new(); rooms.rooms()];
     for (_, pose) in &plan.sampled {
-        poses[rooms.seen_from(position(pose), &axes(pose))].iter_mut().for_each(|of_room| of_room.push(*pose));
+        rooms.seen_from(position(pose), &axes(pose)).into_iter().for_each(|room| poses[room].push(*pose));
     }
     poses
 }

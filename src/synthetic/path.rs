@@ -58,7 +58,7 @@ impl CameraPath {
         let (rounds, of) = match path.kind {
             PathKind::Sweep => (1, "sweeps"),
             PathKind::Loop => (path.rounds, "rounds"),
-            PathKind::Walk => (plan.rooms() as u32, "rooms"),
+            PathKind::Walk => (plan.way.len() as u32, "rooms"),
             PathKind::Drive => (1, "drives"),
         };
         let room = Vector3::new(config.room.width, config.room.depth, config.room.height);

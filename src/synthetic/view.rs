@@ -87,7 +87,7 @@ impl<'a> View<'a> {
         let mut view =
             Self { still, moving, projected: Vec::new(), origin: position(world_from_camera), world_from_camera: turn };
         let rooms = scene.rooms.plan.seen_from(view.origin, &turn);
-        let solids = scene.rooms.solids(rooms).into_iter().map(|solid| solid as usize);
+        let solids = scene.rooms.solids(&rooms).into_iter().map(|solid| solid as usize);
         view.projected = solids.chain(still.len()..still.len() + moving.len()).filter_map(|solid| view.project(solid)).collect();
         view.projected.sort_by(|a, b| a.outline.near.total_cmp(&b.outline.near).then(a.solid.cmp(&b.solid)));
         view

@@ -5,6 +5,7 @@
 
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
+use glam::DVec3;
 use nalgebra::{SVector, Vector3};
 
 use super::building::{Doorway, FloorPlan};
@@ -36,9 +37,12 @@ impl Walk {
     /// The walk at a mean height above the floor, metres.
     pub fn new(plan: &FloorPlan, height: f64) -> Self {
         let mut points = Vec::new();
-        let mut yaw = plan.doors.first().map_or(0.0, heading);
-        for room in 0..plan.rooms() {
-            yaw = through(plan, room, height, yaw, &mut points);
+        let door = |from: usize, to: usize| plan.door(plan.way[from], plan.way[to]);
+        let mut yaw = plan.way.get(1).and_then(|_| door(0, 1)).map_or(0.0, |first| heading(first.out_of(plan.way[0])));
+        for (k, room) in plan.way.iter().enumerate() {
+            let entrance = k.checked_sub(1).and_then(|before| door(before, k));
+            let exit = plan.way.get(k + 1).and_then(|_| door(k, k + 1));
+            yaw = through(plan, &Visit { room: *room, entrance, exit }, height, yaw, &mut points);
         }
         let mut knots = vec![0.0];
         for pair in points.windows(2) {
@@ -65,22 +69,29 @@ impl Walk {
     }
 }
 
-/// Yaw of someone who walks out through a doorway.
-fn heading(door: &Doorway) -> f64 {
-    door.ahead.y.atan2(door.ahead.x)
+/// A room with the doorways by which it is entered and left.
+struct Visit<'a> {
+    room: usize,
+    entrance: Option<&'a Doorway>,
+    exit: Option<&'a Doorway>,
+}
+
+/// Yaw of someone who walks in a direction.
+fn heading(ahead: DVec3) -> f64 {
+    ahead.y.atan2(ahead.x)
 }
 
 /// Adds the waypoints of a room that is entered with a yaw; returns the yaw at its end.
-fn through(plan: &FloorPlan, room: usize, height: f64, yaw: f64, points: &mut Vec<Waypoint>) -> f64 {
-    let (entrance, exit) = (room.checked_sub(1).map(|k| &plan.doors[k]), plan.doors.get(room));
-    let out = exit.map_or(yaw, heading);
+fn through(plan: &FloorPlan, visit: &Visit<'_>, height: f64, yaw: f64, points: &mut Vec<Waypoint>) -> f64 {
+    let &Visit { room, entrance, exit } = visit;
+    let out = exit.map_or(yaw, |door| heading(door.out_of(room)));
     let aside = (out - yaw + PI).rem_euclid(TAU) - PI;
     let straight = aside.abs() < 0.25 * FRAC_PI_2;
     let side = if straight { if room.is_multiple_of(2) { 1.0 } else { -1.0 } } else { aside.signum() };
     let end = yaw + side * TAU + if straight { 0.0 } else { aside };
-    let at = |p: glam::DVec3, yaw: f64| Waypoint::from([p.x, p.y, height, yaw, DOOR_PITCH_RAD]);
+    let at = |p: DVec3, yaw: f64| Waypoint::from([p.x, p.y, height, yaw, DOOR_PITCH_RAD]);
     if let Some(door) = entrance {
-        points.extend([at(door.middle(), yaw), at(door.middle() + door.ahead * APPROACH, yaw)]);
+        points.extend([at(door.middle(), yaw), at(door.middle() - door.out_of(room) * APPROACH, yaw)]);
     }
     let from = yaw + if entrance.is_some() { side * JOIN_RAD } else { 0.0 };
     let to = end - if exit.is_some() { side * JOIN_RAD } else { 0.0 };
@@ -100,7 +111,7 @@ fn through(plan: &FloorPlan, room: usize, height: f64, yaw: f64, points: &mut Ve
         ]));
     }
     if let Some(door) = exit {
-        points.push(at(door.middle() - door.ahead * APPROACH, end));
+        points.push(at(door.middle() - door.out_of(room) * APPROACH, end));
     }
     end
 }
