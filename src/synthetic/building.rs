@@ -71,7 +71,7 @@ impl FloorPlan {
         let along = (1..plan.rooms()).map(|k| [k - 1, k]);
         let mut doorway = |rooms| plan.doorway(rooms, DOOR_PLACE.0 + (DOOR_PLACE.1 - DOOR_PLACE.0) * rng.f64());
         let mut doors: Vec<Doorway> = along.map(&mut doorway).collect();
-        let returns = plan.returns(config.path.returns);
+        let returns = if config.path.returns { plan.returns() } else { Vec::new() };
         doors.extend(returns.iter().copied().map(&mut doorway));
         plan.doors = doors;
         for room in 0..plan.rooms() {
@@ -81,10 +81,10 @@ impl FloorPlan {
         plan
     }
 
-    /// The last room of each row but the first, and the first of the row before, where the walk returns.
-    fn returns(&self, returns: bool) -> Vec<[usize; 2]> {
+    /// The last room of each row but the first, and the first of the row before, which lies beside it.
+    fn returns(&self) -> Vec<[usize; 2]> {
         let [columns, rows] = self.grid;
-        (1..rows).filter(|_| returns).map(|row| [(row + 1) * columns - 1, (row - 1) * columns]).collect()
+        (1..rows).map(|row| [(row + 1) * columns - 1, (row - 1) * columns]).collect()
     }
 
     /// The doorway between two rooms.
