@@ -10,7 +10,7 @@ use super::paging::FREE_DIVISOR;
 use crate::mapping::MappingError;
 
 /// Least rounds of a refinement: what one stay does to its neighbours, the next round repairs.
-const LEAST_ROUNDS: usize = 2;
+const LEAST_ROUNDS: usize = 6;
 /// Epochs over the keyframes of a stay, about, where there are enough for more rounds; and always, where time bounds the refinement.
 const EPOCHS_A_STAY: usize = 3;
 
@@ -133,19 +133,19 @@ mod tests {
     #[test]
     fn rounds_share_the_steps_and_rates_end_alike_everywhere() {
         // Ten keyframes in stays of four that overlap by two.
-        let mut turns = Turns::new(10, Some(50));
-        let (mut left, mut taken, mut ends) = (50, vec![0; 10], Vec::new());
+        let mut turns = Turns::new(10, Some(150));
+        let (rounds, mut left, mut taken, mut ends) = (LEAST_ROUNDS as f32, 150, vec![0; 10], Vec::new());
         while let Some((round, first)) = turns.next().filter(|(round, _)| *round < LEAST_ROUNDS) {
             let stay: Vec<usize> = (first.saturating_sub(2)..10.min(first + 4)).collect();
             let steps = turns.take(round, &stay, left);
-            assert_eq!(turns.progress(steps), Some(round as f32 / 2.0));
+            assert_eq!(turns.progress(steps), Some(round as f32 / rounds));
             ends.push((round, turns.progress(0).unwrap()));
             left -= steps;
             stay.iter().for_each(|k| taken[*k] += 1);
         }
         assert_eq!(left, 0);
         assert!(taken.iter().all(|turns| *turns >= LEAST_ROUNDS));
-        assert!(ends.iter().all(|(round, end)| *end == (*round as f32 + 1.0) / 2.0), "{ends:?}");
+        assert!(ends.iter().all(|(round, end)| *end == (*round as f32 + 1.0) / rounds), "{ends:?}");
         // Many steps make more rounds, and where time bounds them nobody knows how many.
         assert_eq!(Turns::new(10, Some(300)).rounds, Some(10));
         let mut endless = Turns::new(10, None);
