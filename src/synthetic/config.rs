@@ -104,7 +104,8 @@ pub struct RoomConfig {
     pub depth: f64,
     /// Floor to ceiling.
     pub height: f64,
-    /// Rooms along x and along y, all of the size above; doorways join them in one chain, and more where `path.returns`. More than one need a path of kind `walk`.
+    /// Rooms along x and along y, all of the size above; doorways join them in one chain, with more of them where `path.returns`. More than one
+    /// room need a path of kind `walk`.
     #[serde(skip_serializing_if = "is_one_room")]
     pub rooms: [usize; 2],
     /// 0 for purely diffuse surfaces, whose look does not depend on where one stands; up to 1 for highlights on wood, glaze, metal.
