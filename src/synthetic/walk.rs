@@ -37,11 +37,10 @@ impl Walk {
     /// The walk at a mean height above the floor, metres.
     pub fn new(plan: &FloorPlan, height: f64) -> Self {
         let mut points = Vec::new();
-        let door = |from: usize, to: usize| plan.door(plan.way[from], plan.way[to]);
-        let mut yaw = plan.way.get(1).and_then(|_| door(0, 1)).map_or(0.0, |first| heading(first.out_of(plan.way[0])));
+        let doors: Vec<&Doorway> = plan.way.windows(2).filter_map(|pair| plan.door(pair[0], pair[1])).collect();
+        let mut yaw = doors.first().map_or(0.0, |first| heading(first.out_of(plan.way[0])));
         for (k, room) in plan.way.iter().enumerate() {
-            let entrance = k.checked_sub(1).and_then(|before| door(before, k));
-            let exit = plan.way.get(k + 1).and_then(|_| door(k, k + 1));
+            let (entrance, exit) = (k.checked_sub(1).map(|before| doors[before]), doors.get(k).copied());
             yaw = through(plan, &Visit { room: *room, entrance, exit }, height, yaw, &mut points);
         }
         let mut knots = vec![0.0];
