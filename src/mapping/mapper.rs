@@ -129,7 +129,7 @@ impl Mapper {
             trainer: Trainer::with_blending(gpu.clone(), blending)?.with_planar(config.planar),
             cloud: GpuCloud::new(&gpu, config.sh_degree, FIRST_CAPACITY)?.with_antialiasing(config.antialiased),
             anchors: Anchors::default(),
-            chunks: Chunks::begin(None, false),
+            chunks: Chunks::begin(None),
             needing: Vec::new(),
             learnable: Vec::new(),
             turns: Turns::default(),
@@ -151,10 +151,10 @@ impl Mapper {
         })
     }
 
-    /// Gaussians that leave the GPU go to this file and not to an unnamed temporary one. Where it is `lasting`, those that the last checkpoint names
-    /// stay until [`Self::checkpoint_is_written`]. The file of an earlier run is removed.
-    pub fn with_chunks(self, file: Option<PathBuf>, lasting: bool) -> Self {
-        Self { chunks: Chunks::begin(file, lasting), ..self }
+    /// Gaussians that leave the GPU go to this file and not to an unnamed temporary one. Those that a checkpoint names stay until the next, see
+    /// [`Self::checkpoint_is_written`]. The file of an earlier run is removed.
+    pub fn with_chunks(self, file: Option<PathBuf>) -> Self {
+        Self { chunks: Chunks::begin(file), ..self }
     }
 
     /// Takes in a keyframe: inserts what the map lacks, optimises over the window, prunes. `interlude` comes between the steps. A keyframe

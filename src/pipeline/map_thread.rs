@@ -152,13 +152,12 @@ impl MapThread<'_> {
 
     /// A new mapper and an empty map, or those of a checkpoint.
     fn start(&self, checkpointer: Option<&mut Checkpointer>) -> Result<Start, PipelineError> {
-        let has_checkpoints = checkpointer.is_some();
         if let Some(checkpointer) = checkpointer
             && let Some(state) = checkpointer.take_state()
         {
             return self.catch_up(checkpointer, state);
         }
-        let mapper = Mapper::new(self.gpu.clone(), self.config)?.with_chunks(self.chunks.map(Path::to_owned), has_checkpoints);
+        let mapper = Mapper::new(self.gpu.clone(), self.config)?.with_chunks(self.chunks.map(Path::to_owned));
         Ok(Start { mapper, map: Default::default(), refinement: None, records: Vec::new() })
     }
 

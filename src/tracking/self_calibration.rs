@@ -1,5 +1,5 @@
 //! The camera of a recording without a calibration, from its own frames: the monocular tracker makes a map with an assumed focal length, bundle
-//! adjustment of that map estimates focal length and distortion, and the next map is made with these; the answer is the mean of several.
+//! adjustment of that map estimates focal length and radial distortion, and the next map is made with these; the answer is the mean of several.
 //!
 //! The principal point is taken to be the centre of the image, and pixels to be square.
 
@@ -25,7 +25,7 @@ const NEAR_FOCAL: f64 = 0.05;
 const NEAR_K1: f64 = 0.05;
 /// Keyframes that an answer needs, and of which one is made, at most: the first ones.
 const LEAST_KEYFRAMES: usize = 6;
-const MOST_KEYFRAMES: usize = 60;
+const MOST_KEYFRAMES: usize = 150;
 /// Landmarks that fewer keyframes see say little.
 const LEAST_VIEWS: usize = 3;
 const STEPS: usize = 40;
@@ -87,7 +87,7 @@ pub enum SelfCalibrationError {
 fn camera(lens: Lens, width: u32, height: u32) -> Camera {
     let assumed = Camera::assumed(width, height);
     let pinhole = Pinhole { fx: lens.focal, fy: lens.focal, ..assumed.pinhole };
-    Camera { pinhole, distortion: Distortion { k1: lens.k1, ..Distortion::default() }, ..assumed }
+    Camera { pinhole, distortion: lens.distortion, ..assumed }
 }
 
 /// The camera of consecutive frames that were extracted with [`Camera::assumed`].
@@ -102,11 +102,11 @@ pub fn self_calibrate(
     let side = f64::from(width.max(height));
     let mut least_deviation = f64::INFINITY;
     for assumed in ASSUMED {
-        let mut lens = Lens { focal: assumed * side, k1: 0.0 };
+        let mut lens = Lens { focal: assumed * side, distortion: Distortion::default() };
         let (mut estimates, mut maps): (Vec<Estimate>, usize) = (Vec::new(), 0);
         while let Some(estimate) = adjust(frames, &lens, (width, height), config)? {
-            let Lens { focal, k1 } = estimate.lens;
-            tracing::debug!(focal, k1, deviation = estimate.deviation.focal, "self-calibration");
+            let Lens { focal, distortion } = estimate.lens;
+            tracing::debug!(focal, ?distortion, deviation = estimate.deviation.focal, "self-calibration");
             if !PLAUSIBLE.contains(&(focal / side)) {
                 break;
             }
@@ -118,8 +118,7 @@ pub fn self_calibrate(
                 continue;
             }
             estimates.push(estimate);
-            let mean = |of: &dyn Fn(&Estimate) -> f64| estimates.iter().map(of).sum::<f64>() / estimates.len() as f64;
-            lens = Lens { focal: mean(&|e| e.lens.focal.ln()).exp(), k1: mean(&|e| e.lens.k1) };
+            lens = mean(&estimates);
             if estimates.len() == ROUNDS {
                 let found = combine(&estimates, lens, (width, height), config);
                 let deviation = found.focal_sigma / lens.focal;
@@ -137,7 +136,19 @@ pub fn self_calibrate(
     })
 }
 
-/// The mean of the estimates, with the deviation that they state and the one that they show.
+fn mean(estimates: &[Estimate]) -> Lens {
+    let mean = |of: &dyn Fn(&Lens) -> f64| estimates.iter().map(|e| of(&e.lens)).sum::<f64>() / estimates.len() as f64;
+    let distortion = Distortion {
+        k1: mean(&|lens| lens.distortion.k1),
+        k2: mean(&|lens| lens.distortion.k2),
+        p1: mean(&|lens| lens.distortion.p1),
+        p2: mean(&|lens| lens.distortion.p2),
+        k3: 0.0,
+    };
+    Lens { focal: mean(&|lens| lens.focal.ln()).exp(), distortion }
+}
+
+/// The mean of the estimates, with their own deviation and the one between them.
 fn combine(estimates: &[Estimate], lens: Lens, (width, height): (u32, u32), config: &TrackingConfig) -> SelfCalibration {
     let count = estimates.len() as f64;
     let sigma = |off: &dyn Fn(&Estimate) -> f64, stated: &dyn Fn(&Estimate) -> f64| {
@@ -149,7 +160,7 @@ fn combine(estimates: &[Estimate], lens: Lens, (width, height): (u32, u32), conf
     SelfCalibration {
         camera: camera(lens, width, height),
         focal_sigma: lens.focal * sigma(&|e| (e.lens.focal / lens.focal).ln(), &|e| e.deviation.focal),
-        k1_sigma: sigma(&|e| e.lens.k1 - lens.k1, &|e| e.deviation.k1),
+        k1_sigma: sigma(&|e| e.lens.distortion.k1 - lens.distortion.k1, &|e| e.deviation.k1),
         keyframes: last.keyframes,
         observations: last.observations,
         rms_pixels: last.rms * config.pixel_sigma,
@@ -158,7 +169,7 @@ fn combine(estimates: &[Estimate], lens: Lens, (width, height): (u32, u32), conf
 
 impl Lens {
     fn is_near(&self, other: &Self) -> bool {
-        (self.focal / other.focal).ln().abs() < NEAR_FOCAL && (self.k1 - other.k1).abs() < NEAR_K1
+        (self.focal / other.focal).ln().abs() < NEAR_FOCAL && (self.distortion.k1 - other.distortion.k1).abs() < NEAR_K1
     }
 }
 
@@ -211,7 +222,8 @@ fn adjust(
     problem.drop_hidden();
     problem.solve(STEPS);
     problem.drop_outliers();
-    let Some(deviation) = problem.solve(STEPS) else { return Ok(None) };
+    problem.solve(STEPS);
+    let Some(deviation) = problem.deviation(STEPS) else { return Ok(None) };
     let (rms, observations) = problem.agreement();
     Ok(Some(Estimate { lens: problem.lens, deviation, keyframes: keyframes.len(), observations, rms }))
 }

@@ -36,7 +36,7 @@ fn elsewhere(id: usize) -> Keyframe {
 }
 
 fn walk(gpu: &Arc<Gpu>, config: &MappingConfig, file: Option<&Path>) -> Mapper {
-    let mut mapper = Mapper::new(gpu.clone(), config).unwrap().with_chunks(file.map(Into::into), false);
+    let mut mapper = Mapper::new(gpu.clone(), config).unwrap().with_chunks(file.map(Into::into));
     (0..KEYFRAMES).for_each(|id| assert_eq!(mapper.insert(&elsewhere(id), &|| false).unwrap().id, id));
     mapper
 }

@@ -72,11 +72,19 @@ pub(super) struct Chunks {
     state: ChunksState,
     index: Index,
     returned: Vec<Returned>,
-    /// So many of these had come back before the last download, if there was any.
-    downloaded: Mutex<Option<usize>>,
+    downloaded: Mutex<Downloaded>,
     store: Store,
-    /// Whether there are checkpoints.
-    lasting: bool,
+    /// Chunks from this number on left after the last checkpoint.
+    in_checkpoint: ChunkId,
+}
+
+/// The last download of the Gaussians on the GPU.
+#[derive(Clone, Copy, Debug, Default)]
+struct Downloaded {
+    /// Chunks from this number on left after it.
+    before: ChunkId,
+    /// So many of [`Chunks::returned`] had come back before it, where these have not been looked through since.
+    returned: usize,
 }
 
 /// The chunks of a checkpoint; their Gaussians lie in a file beside it.
@@ -90,10 +98,10 @@ pub(super) struct ChunksState {
 }
 
 impl Chunks {
-    /// None yet. What leaves the GPU goes to the file, where that of an earlier run is removed, or to an unnamed one. Where it is `lasting`, what the last
-    /// checkpoint names stays until the next.
-    pub fn begin(file: Option<PathBuf>, lasting: bool) -> Self {
-        Self::with(ChunksState::default(), Store::begin(file), lasting)
+    /// None yet. What leaves the GPU goes to the file, where that of an earlier run is removed, or to an unnamed one. What a checkpoint names stays there
+    /// until the next.
+    pub fn begin(file: Option<PathBuf>) -> Self {
+        Self::with(ChunksState::default(), Store::begin(file))
     }
 
     /// Those of a checkpoint.
@@ -102,11 +110,11 @@ impl Chunks {
     /// If the file is missing or too short.
     pub fn restore(file: Option<PathBuf>, state: &ChunksState) -> Result<Self, MappingError> {
         let store = Store::restore(file, state.away.values().map(|chunk| &chunk.stored))?;
-        Ok(Self::with(state.clone(), store, true))
+        Ok(Self { in_checkpoint: state.next, ..Self::with(state.clone(), store) })
     }
 
-    fn with(state: ChunksState, store: Store, lasting: bool) -> Self {
-        Self { index: state.index(), state, returned: Vec::new(), downloaded: Mutex::default(), store, lasting }
+    fn with(state: ChunksState, store: Store) -> Self {
+        Self { index: state.index(), state, returned: Vec::new(), downloaded: Mutex::default(), store, in_checkpoint: 0 }
     }
 
     /// What a checkpoint needs. The file is flushed to the disk.
@@ -120,20 +128,22 @@ impl Chunks {
 
     /// A checkpoint of the present state has been written.
     pub fn checkpoint_is_written(&mut self) {
+        self.in_checkpoint = self.state.next;
         self.returned.iter_mut().for_each(|returned| returned.in_checkpoint = false);
         self.reuse_places();
     }
 
     /// The Gaussians on the GPU have been downloaded. Returns which ones are away now; they stay on the disk until the next download.
     pub fn snapshot(&self) -> BTreeSet<ChunkId> {
-        *self.downloaded.lock().unwrap_or_else(PoisonError::into_inner) = Some(self.returned.len());
+        *self.downloaded.lock().unwrap_or_else(PoisonError::into_inner) =
+            Downloaded { before: self.state.next, returned: self.returned.len() };
         self.away()
     }
 
     fn reuse_places(&mut self) {
         let Self { returned, downloaded, store, .. } = self;
         let downloaded = downloaded.get_mut().unwrap_or_else(PoisonError::into_inner);
-        let before = downloaded.as_mut().map_or(returned.len(), std::mem::take);
+        let before = std::mem::take(&mut downloaded.returned);
         returned[..before].iter_mut().for_each(|returned| returned.in_snapshot = false);
         returned.retain(|returned| {
             let is_kept = returned.in_snapshot || returned.in_checkpoint;
@@ -242,7 +252,8 @@ impl Chunks {
         self.state.gaussians -= chunk.gaussians;
         self.index.remove(id, &chunk.bounds);
         self.index.forget(id, chunk.keyframes.keys());
-        self.returned.push(Returned { id, chunk, in_snapshot: true, in_checkpoint: self.lasting });
+        let downloaded = self.downloaded.get_mut().unwrap_or_else(PoisonError::into_inner);
+        self.returned.push(Returned { id, chunk, in_snapshot: id < downloaded.before, in_checkpoint: id < self.in_checkpoint });
     }
 
     /// Keyframes have moved, and their Gaussians with them; returns how many of these are away.
@@ -319,5 +330,43 @@ impl Members {
     /// Some of them.
     pub fn picked(&self, which: &[usize]) -> Self {
         Self { part: self.part.picked(which), keyframes: which.iter().map(|i| self.keyframes[*i]).collect() }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// What a checkpoint or a download names stays where it is until the next one; all else that has come back makes room at once.
+    #[test]
+    fn the_file_grows_by_what_is_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("chunks.bin");
+        let mut chunks = Chunks::begin(Some(file.clone()));
+        let leave = |chunks: &mut Chunks| chunks.put(&Members { part: CloudPart::default(), keyframes: vec![3; 5] }, 0);
+        let come_back = |chunks: &mut Chunks| (chunks.away().into_iter()).for_each(|id| chunks.is_back(id));
+        let round_trips = |chunks: &mut Chunks| {
+            (0..4).for_each(|_| {
+                leave(chunks);
+                come_back(chunks);
+            });
+            std::fs::metadata(&file).unwrap().len()
+        };
+        let one = round_trips(&mut chunks);
+        assert!(one > 0 && round_trips(&mut chunks) == one);
+        leave(&mut chunks);
+        chunks.state().unwrap();
+        chunks.checkpoint_is_written();
+        come_back(&mut chunks);
+        assert_eq!(round_trips(&mut chunks), 2 * one);
+        leave(&mut chunks);
+        assert_eq!(chunks.snapshot().len(), 1);
+        come_back(&mut chunks);
+        assert_eq!(round_trips(&mut chunks), 3 * one);
+        chunks.checkpoint_is_written();
+        assert!(chunks.snapshot().is_empty());
+        leave(&mut chunks);
+        assert_eq!(chunks.returned.len(), 0);
+        assert_eq!(round_trips(&mut chunks), 3 * one);
     }
 }
