@@ -1,5 +1,5 @@
 //! The camera of a recording without a calibration, from its own frames: the monocular tracker makes a map with an assumed focal length, bundle
-//! adjustment of that map estimates focal length and radial distortion, and the next map is made with these; the answer is the mean of several.
+//! adjustment of that map estimates focal length and distortion, and the next map is made with these; the answer is the mean of several.
 //!
 //! The principal point is taken to be the centre of the image, and pixels to be square.
 
@@ -107,7 +107,7 @@ pub fn self_calibrate(
         while let Some(estimate) = adjust(frames, &lens, (width, height), config)? {
             let Lens { focal, distortion } = estimate.lens;
             tracing::debug!(focal, ?distortion, deviation = estimate.deviation.focal, "self-calibration");
-            if !PLAUSIBLE.contains(&(focal / side)) {
+            if !estimate.lens.is_plausible((width, height)) {
                 break;
             }
             maps += 1;
@@ -168,6 +168,17 @@ fn combine(estimates: &[Estimate], lens: Lens, (width, height): (u32, u32), conf
 }
 
 impl Lens {
+    /// Whether it is a usual lens, whose distorted pixels stay in their order out to the corners.
+    fn is_plausible(&self, (width, height): (u32, u32)) -> bool {
+        let Distortion { k1, k2, .. } = self.distortion;
+        let corner = 0.5 * f64::from(width).hypot(height.into()) / self.focal;
+        let grows = |part: u32| {
+            let r2 = (corner * f64::from(part) / 8.0).powi(2);
+            1.0 + r2 * (3.0 * k1 + 5.0 * k2 * r2) > 0.0
+        };
+        PLAUSIBLE.contains(&(self.focal / f64::from(width.max(height)))) && (1..=8).all(grows)
+    }
+
     fn is_near(&self, other: &Self) -> bool {
         (self.focal / other.focal).ln().abs() < NEAR_FOCAL && (self.distortion.k1 - other.distortion.k1).abs() < NEAR_K1
     }

@@ -1,7 +1,8 @@
-//! Bundle adjustment that also estimates the focal length and the distortion of the one camera, two radial and two tangential terms: Levenberg-Marquardt on pixels as they were recorded, with the points eliminated (Triggs et al., *Bundle adjustment: a modern synthesis*, 2000; Brown, *Close-range camera
-//! calibration*, 1971).
+//! Bundle adjustment that also estimates the focal length and the distortion of the one camera, two radial and two tangential terms:
+//! Levenberg-Marquardt on pixels as they were recorded, with the points eliminated (Triggs et al., *Bundle adjustment: a modern synthesis*, 2000;
+//! Brown, *Close-range camera calibration*, 1971).
 //!
-//! For some tens of poses: the reduced system is dense. The first pose stays; the scale is free, and damping alone holds it.
+//! For one or two hundred poses: the reduced system is dense. The first pose stays; the scale is free, and damping alone holds it.
 
 use nalgebra::{DMatrix, DVector, Matrix2, Matrix2x3, Matrix2x6, Matrix3, Point3, SMatrix, SVector, Vector2, Vector3, Vector6};
 
