@@ -142,7 +142,17 @@ task_on_n2() {
     return 1
 }
 node_down() { [[ $(sinfo -h -n n2 -o %T) = down* ]]; }
-kill-controller() { submit; wait_until 180 some_run; kill -9 "$(pid_of slurmctld)"; sleep 8; slurmctld; }
+kill-controller() {
+    submit
+    touch "$work/submitted"
+    wait_until 180 some_run
+    wait_until 60 jobs_saved || echo "the controller does not save its jobs" >&2
+    kill -9 "$(pid_of slurmctld)"
+    sleep 8
+    slurmctld
+}
+# What Slurm has not saved is lost with the controller.
+jobs_saved() { [ "$work/state/job_state" -nt "$work/submitted" ]; }
 # Tasks of minutes with a limit of one: each leaves with a checkpoint, is requeued and goes on.
 short-limit() { submit --time=1 --signal=B:USR1@30; }
 # The same without the early signal, and without requeueing: Slurm's own end.
