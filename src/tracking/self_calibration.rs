@@ -118,7 +118,7 @@ pub fn self_calibrate(
                 continue;
             }
             estimates.push(estimate);
-            lens = mean(&estimates);
+            lens = mean_lens(&estimates);
             if estimates.len() == ROUNDS {
                 let found = combine(&estimates, lens, (width, height), config);
                 let deviation = found.focal_sigma / lens.focal;
@@ -136,7 +136,7 @@ pub fn self_calibrate(
     })
 }
 
-fn mean(estimates: &[Estimate]) -> Lens {
+fn mean_lens(estimates: &[Estimate]) -> Lens {
     let mean = |of: &dyn Fn(&Lens) -> f64| estimates.iter().map(|e| of(&e.lens)).sum::<f64>() / estimates.len() as f64;
     let distortion = Distortion {
         k1: mean(&|lens| lens.distortion.k1),

@@ -75,7 +75,7 @@ pub(super) struct Chunks {
     downloaded: Mutex<Downloaded>,
     store: Store,
     /// Chunks from this number on left after the last checkpoint.
-    in_checkpoint: ChunkId,
+    checkpoint_before: ChunkId,
 }
 
 /// The last download of the Gaussians on the GPU.
@@ -110,11 +110,11 @@ impl Chunks {
     /// If the file is missing or too short.
     pub fn restore(file: Option<PathBuf>, state: &ChunksState) -> Result<Self, MappingError> {
         let store = Store::restore(file, state.away.values().map(|chunk| &chunk.stored))?;
-        Ok(Self { in_checkpoint: state.next, ..Self::with(state.clone(), store) })
+        Ok(Self { checkpoint_before: state.next, ..Self::with(state.clone(), store) })
     }
 
     fn with(state: ChunksState, store: Store) -> Self {
-        Self { index: state.index(), state, returned: Vec::new(), downloaded: Mutex::default(), store, in_checkpoint: 0 }
+        Self { index: state.index(), state, returned: Vec::new(), downloaded: Mutex::default(), store, checkpoint_before: 0 }
     }
 
     /// What a checkpoint needs. The file is flushed to the disk.
@@ -128,7 +128,7 @@ impl Chunks {
 
     /// A checkpoint of the present state has been written.
     pub fn checkpoint_is_written(&mut self) {
-        self.in_checkpoint = self.state.next;
+        self.checkpoint_before = self.state.next;
         self.returned.iter_mut().for_each(|returned| returned.in_checkpoint = false);
         self.reuse_places();
     }
@@ -253,7 +253,12 @@ impl Chunks {
         self.index.remove(id, &chunk.bounds);
         self.index.forget(id, chunk.keyframes.keys());
         let downloaded = self.downloaded.get_mut().unwrap_or_else(PoisonError::into_inner);
-        self.returned.push(Returned { id, chunk, in_snapshot: id < downloaded.before, in_checkpoint: id < self.in_checkpoint });
+        self.returned.push(Returned {
+            id,
+            chunk,
+            in_snapshot: id < downloaded.before,
+            in_checkpoint: id < self.checkpoint_before,
+        });
     }
 
     /// Keyframes have moved, and their Gaussians with them; returns how many of these are away.
