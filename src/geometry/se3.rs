@@ -3,7 +3,7 @@
 //! Transforms read `a_from_b`. A tangent vector is `τ = (ρ, θ)`, translation first, and perturbs from the left: `T ← Exp(τ)·T`
 //! (Barfoot, *State Estimation for Robotics*, ch. 7; Solà, *A micro Lie theory*, 2018).
 
-use nalgebra::{Isometry3, Matrix3, Translation3, UnitQuaternion, Vector3, Vector6};
+use nalgebra::{Isometry3, Matrix3, Matrix6, Translation3, UnitQuaternion, Vector3, Vector6};
 
 /// A rigid motion; its action is `p_in_a = a_from_b * p_in_b`, metres.
 pub type Se3 = Isometry3<f64>;
@@ -29,6 +29,16 @@ pub fn log(a_from_b: &Se3) -> Vector6<f64> {
     let theta = a_from_b.rotation.scaled_axis();
     let rho = left_jacobian_inverse(&theta) * a_from_b.translation.vector;
     Vector6::new(rho.x, rho.y, rho.z, theta.x, theta.y, theta.z)
+}
+
+/// The adjoint of a motion: `T·Exp(τ) = Exp(adjoint(T)·τ)·T`.
+pub fn adjoint(a_from_b: &Se3) -> Matrix6<f64> {
+    let rotation = *a_from_b.rotation.to_rotation_matrix().matrix();
+    let mut adjoint = Matrix6::zeros();
+    adjoint.fixed_view_mut::<3, 3>(0, 0).copy_from(&rotation);
+    adjoint.fixed_view_mut::<3, 3>(0, 3).copy_from(&(skew(&a_from_b.translation.vector) * rotation));
+    adjoint.fixed_view_mut::<3, 3>(3, 3).copy_from(&rotation);
+    adjoint
 }
 
 /// The left Jacobian of SO(3), `V(θ)`.

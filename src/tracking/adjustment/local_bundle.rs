@@ -10,9 +10,11 @@ use std::collections::BTreeMap;
 use crate::geometry::{Pinhole, Se3};
 use crate::tracking::TrackingConfig;
 use crate::tracking::map::sparse_map::{Map, Observation};
+use crate::tracking::map::tally::distinct;
 use crate::tracking::rig::Rig;
 use crate::tracking::solvers::bundle::{BundleObservation, BundleProblem};
 use crate::tracking::solvers::depth_bias::{BiasPrior, DepthBias};
+use crate::tracking::solvers::relative_pose::RelativePose;
 use crate::tracking::solvers::residual::InlierClass;
 
 /// Keyframes that share fewer landmarks than this are not moved together.
@@ -55,7 +57,9 @@ impl Adjustment {
                 return None;
             }
         }
-        let is_held = |k: &usize| map.covisible(*k).first().is_some_and(|(_, shared)| *shared >= MIN_SHARED);
+        let is_held = |k: &usize| {
+            map.relative_poses(*k).next().is_some() || map.covisible(*k).first().is_some_and(|(_, shared)| *shared >= MIN_SHARED)
+        };
         let (free, carried): (Vec<usize>, Vec<usize>) = map.living_in(root).filter(|k| *k != root).partition(is_held);
         Some(Self { carried, ..Self::new(map, &free, &[root], rig)? })
     }
@@ -155,11 +159,14 @@ pub fn adjust_window(map: &mut Map, keyframe: usize, rig: &Rig) {
 /// Keyframes that move (`keyframe` among them) and keyframes that hold them.
 fn choose_window(map: &Map, keyframe: usize, config: &TrackingConfig) -> (Vec<usize>, Vec<usize>) {
     let neighbours = map.covisible(keyframe).into_iter().filter(|(_, shared)| *shared >= MIN_SHARED).map(|(k, _)| k);
-    let mut free: Vec<usize> = std::iter::once(keyframe).chain(neighbours).take(config.window_keyframes).collect();
+    let references = |k: &usize| map.relative_poses(*k).map(|relative| relative.reference);
+    let mut free = distinct(std::iter::once(keyframe).chain(references(&keyframe)).chain(neighbours));
+    free.truncate(config.window_keyframes);
     free.retain(|k| !map.is_root(*k));
     let landmarks = map.landmarks_of(&free);
-    let covisibility = map.covisibility(landmarks.into_iter());
-    let mut fixed: Vec<usize> = covisibility.into_iter().map(|(k, _)| k).filter(|k| !free.contains(k)).take(MAX_FIXED).collect();
+    let covisible = map.covisibility(landmarks.into_iter()).into_iter().map(|(k, _)| k);
+    let mut fixed = distinct(free.iter().flat_map(references).chain(covisible).filter(|k| !free.contains(k)));
+    fixed.truncate(MAX_FIXED);
     if fixed.is_empty()
         && let Some(oldest) = free.iter().copied().min()
     {
@@ -184,6 +191,14 @@ fn make_problem(
         depth_bias: rig.depth_bias,
         ..Default::default()
     };
+    for (k, current) in &place {
+        let measured = map.relative_poses(*k).filter_map(|relative| Some((relative, *place.get(&relative.reference)?)));
+        problem.relative_poses.extend(measured.map(|(relative, reference)| RelativePose {
+            current: *current,
+            reference,
+            ..*relative
+        }));
+    }
     let mut observations = Vec::new();
     for (point, l) in landmarks.iter().enumerate() {
         for observation in &map.landmarks[*l].observations {

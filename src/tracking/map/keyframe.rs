@@ -8,6 +8,7 @@ use crate::geometry::Se3;
 use crate::tracking::features::dense_frame::DenseFrame;
 use crate::tracking::features::frame_features::FrameFeatures;
 use crate::tracking::map::sparse_map::Map;
+use crate::tracking::solvers::relative_pose::RelativePose;
 
 #[derive(Clone, Debug)]
 pub struct Keyframe {
@@ -27,6 +28,8 @@ pub struct Keyframe {
     pub features: Arc<FrameFeatures>,
     /// Its pixels: where landmarks are few, and of the first in a submap, if there is depth.
     pub dense: Option<Arc<DenseFrame>>,
+    /// Its pose relative to older keyframes by all pixels, where landmarks are few; poses are named by keyframe.
+    pub relative_poses: Vec<RelativePose>,
     /// The landmark that each feature shows.
     pub landmarks: Vec<Option<usize>>,
 }
@@ -53,6 +56,7 @@ impl Keyframe {
             landmarks: vec![None; features.len()],
             features,
             dense: None,
+            relative_poses: Vec::new(),
         }
     }
 

@@ -19,6 +19,7 @@ use crate::tracking::map::keyframe_database::KeyframeDatabase;
 pub use crate::tracking::map::landmark::{Landmark, LandmarkState, Observation};
 use crate::tracking::map::tally::{distinct, tally};
 use crate::tracking::map::trim;
+use crate::tracking::solvers::relative_pose::RelativePose;
 
 /// Links that a keyframe keeps.
 const MOST_LINKS: usize = 5;
@@ -64,6 +65,10 @@ impl Map {
             keyframe.root += keyframes;
             keyframe.camera_from_world *= other_from_world;
             keyframe.landmarks.iter_mut().flatten().for_each(|l| *l += landmarks);
+            for relative in &mut keyframe.relative_poses {
+                relative.current += keyframes;
+                relative.reference += keyframes;
+            }
             self.push(keyframe);
         }
         for mut landmark in other.landmarks {
@@ -251,6 +256,11 @@ impl Map {
         let mut ranked = self.covisibility(self.keyframes[keyframe].landmarks.iter().flatten().copied());
         ranked.retain(|(other, _)| *other != keyframe);
         ranked
+    }
+
+    /// A keyframe's measured poses relative to older keyframes that have not been culled.
+    pub fn relative_poses(&self, keyframe: usize) -> impl Iterator<Item = &RelativePose> {
+        self.keyframes[keyframe].relative_poses.iter().filter(|relative| self.living.contains(&relative.reference))
     }
 
     /// The keyframes of a submap that have not been culled, in ascending order.

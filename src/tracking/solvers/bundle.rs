@@ -8,6 +8,7 @@ use nalgebra::{Matrix3, Matrix6, Matrix6x3, Point3, Vector3, Vector6};
 
 use crate::geometry::{Pinhole, Se3, se3};
 use crate::tracking::solvers::depth_bias::{BiasPrior, DepthBias};
+use crate::tracking::solvers::relative_pose::{RelativePose, RelativeTerms};
 use crate::tracking::solvers::residual::{InlierClass, Measurement};
 use crate::tracking::solvers::schur::ReducedSystem;
 
@@ -36,6 +37,8 @@ pub struct BundleProblem {
     pub points: Vec<Point3<f64>>,
     /// Sorted by point.
     pub observations: Vec<BundleObservation>,
+    /// Measured beside the observations.
+    pub relative_poses: Vec<RelativePose>,
     /// Of all measured depths.
     pub depth_bias: DepthBias,
     /// What is known of the bias beforehand. Without a prior the bias stays as it is.
@@ -55,6 +58,8 @@ struct System {
     gradient_blocks: Vec<Vector6<f64>>,
     /// Of the bias (rows) and each free pose (columns).
     bias_by_pose: Vec<Matrix6<f64>>,
+    /// Row, column (below the row) and block of two free poses with a measured relative pose.
+    pose_by_pose: Vec<(usize, usize, Matrix6<f64>)>,
     hessian_points: Vec<Matrix3<f64>>,
     gradient_points: Vec<Vector3<f64>>,
     /// Sorted by point.
@@ -119,7 +124,7 @@ impl BundleProblem {
                 None => return f64::INFINITY,
             }
         }
-        sum
+        sum + self.relative_poses.iter().map(|relative| relative.cost(&self.poses)).sum::<f64>()
     }
 
     /// An observation's measurement as far as it is trusted, freed of the bias.
@@ -136,6 +141,7 @@ impl BundleProblem {
             hessian_blocks: vec![Matrix6::zeros(); self.blocks()],
             gradient_blocks: vec![Vector6::zeros(); self.blocks()],
             bias_by_pose: vec![Matrix6::zeros(); self.free_poses],
+            pose_by_pose: Vec::new(),
             hessian_points: vec![Matrix3::zeros(); self.points.len()],
             gradient_points: vec![Vector3::zeros(); self.points.len()],
             mixed: Vec::with_capacity(self.observations.len() + self.points.len()),
@@ -146,6 +152,7 @@ impl BundleProblem {
             system.hessian_blocks[bias] = Matrix6::from_diagonal(&padded(&prior.information));
             system.gradient_blocks[bias] = padded(&prior.pull(&self.depth_bias).0);
         }
+        self.relative_poses.iter().for_each(|relative| self.add_relative_pose(relative, &mut system));
         for group in self.observations.chunk_by(|a, b| a.point == b.point) {
             let point = group[0].point;
             let mut bias_by_point = Matrix6x3::zeros();
@@ -187,6 +194,20 @@ impl BundleProblem {
         system
     }
 
+    fn add_relative_pose(&self, relative: &RelativePose, system: &mut System) {
+        let RelativeTerms { current, reference, mixed } = relative.linearise(&self.poses);
+        for (pose, (hessian, gradient)) in [(relative.current, current), (relative.reference, reference)] {
+            if pose < self.free_poses {
+                system.hessian_blocks[pose] += hessian;
+                system.gradient_blocks[pose] += gradient;
+            }
+        }
+        let (row, column) = (relative.current.max(relative.reference), relative.current.min(relative.reference));
+        if row < self.free_poses {
+            system.pose_by_pose.push((row, column, if row == relative.current { mixed } else { mixed.transpose() }));
+        }
+    }
+
     /// Sparsity of the reduced system; `None` if it has too many blocks.
     fn reduced_system(&self) -> Option<ReducedSystem> {
         let bias = self.free_poses;
@@ -197,7 +218,8 @@ impl BundleProblem {
             pairs
         });
         let with_bias = (0..if self.bias_prior.is_some() { bias } else { 0 }).map(|pose| (bias, pose));
-        ReducedSystem::new(self.blocks(), seen.chain(with_bias))
+        let relative = self.relative_poses.iter().map(|r| (r.current, r.reference)).filter(|(a, b)| is_free(a) && is_free(b));
+        ReducedSystem::new(self.blocks(), seen.chain(with_bias).chain(relative))
     }
 
     /// Takes one damped step; `false` if the equations cannot be solved.
@@ -247,6 +269,9 @@ fn solve_blocks(
         for (pose, coupling) in system.bias_by_pose.iter().enumerate() {
             blocks[reduced.place(bias, pose)] = *coupling;
         }
+    }
+    for (row, column, block) in &system.pose_by_pose {
+        blocks[reduced.place(*row, *column)] += block;
     }
     for group in system.mixed.chunk_by(|a, b| a.point == b.point) {
         let point = group[0].point;

@@ -73,6 +73,21 @@ fn outliers_are_found_and_do_not_pull() {
 }
 
 #[test]
+fn measured_relative_poses_hold_cameras_without_points() {
+    let (mut problem, truth) = scene(0.0, false);
+    (problem.points, problem.observations) = (Vec::new(), Vec::new());
+    for (current, reference) in [(0, 4), (1, 0), (1, 2), (3, 2), (5, 3), (0, 3)] {
+        let current_from_reference = truth.poses[current] * truth.poses[reference].inverse();
+        let information = Matrix6::identity() * 1e4;
+        problem.relative_poses.push(RelativePose { current, reference, current_from_reference, information });
+    }
+    let before = worst_pose_error(&problem, &truth);
+    problem.solve(&PINHOLE, 30);
+    let after = worst_pose_error(&problem, &truth);
+    assert!(before > 0.02 && after < 1e-6, "{before} → {after}");
+}
+
+#[test]
 fn wrong_depths_hardly_pull() {
     let (mut problem, truth) = scene(0.0, false);
     for o in problem.observations.iter_mut().filter(|o| o.point % 7 == 0) {

@@ -7,6 +7,7 @@ pub mod intrinsics;
 pub mod pixel_noise;
 pub mod pose;
 pub mod pose_graph;
+pub mod relative_pose;
 pub mod residual;
 pub mod schur;
 pub mod sim3_alignment;

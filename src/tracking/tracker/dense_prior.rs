@@ -7,13 +7,17 @@ use super::Tracker;
 use crate::geometry::Se3;
 use crate::tracking::features::dense_frame::DenseFrame;
 use crate::tracking::front_end::ExtractedFrame;
-use crate::tracking::localisation::dense_alignment::align;
+use crate::tracking::localisation::dense_alignment::{Aligned, align};
 use crate::tracking::localisation::localise::{Context, LastFrame, Localised};
+use crate::tracking::map::tally::distinct;
+use crate::tracking::solvers::relative_pose::RelativePose;
 
 /// Frames without a pose after which pixels no longer say where the camera is.
 const MAX_FRAMES_BRIDGED: usize = 2;
 /// Overlap from which on the newest keyframe is the better reference than the last frame.
 const KEYFRAME_OVERLAP: f64 = 0.5;
+/// Keyframes that a keyframe is aligned to: before it, and of those that share most with it.
+const RELATIVE_TO: usize = 3;
 
 impl Tracker {
     /// The frame's pose from all its pixels and the landmarks that agree: against the last frame, then against the newest keyframe, which drifts
@@ -35,6 +39,27 @@ impl Tracker {
         }
         let mut context = Context { map: &mut self.map, rig: &self.rig };
         Some(context.with_prior(&frame.features, prior, self.motion.reference))
+    }
+
+    /// Poses of the frame that becomes a keyframe relative to older ones, by all pixels: those before it and those that share most landmarks with it.
+    pub(super) fn relative_poses(
+        &self,
+        dense: &DenseFrame,
+        camera_from_world: &Se3,
+        landmarks: &[Option<usize>],
+    ) -> Vec<RelativePose> {
+        let (map, root) = (&self.map, self.map.keyframes[self.motion.reference].root);
+        let covisible = map.covisibility(landmarks.iter().flatten().copied()).into_iter().map(|(k, _)| k).take(RELATIVE_TO);
+        let before = map.living.iter().rev().copied().filter(|k| map.keyframes[*k].root == root).take(RELATIVE_TO);
+        let references = distinct(before.chain(covisible)).into_iter();
+        let relative = |reference: usize| {
+            let keyframe = &map.keyframes[reference];
+            let guess = camera_from_world * keyframe.camera_from_world.inverse();
+            let found = align(keyframe.dense.as_ref()?, dense, &[guess]).filter(|found| found.overlap >= KEYFRAME_OVERLAP)?;
+            let Aligned { current_from_reference, information, .. } = found;
+            Some(RelativePose { current: map.keyframes.len(), reference, current_from_reference, information })
+        };
+        references.filter_map(relative).collect()
     }
 
     /// Keeps a tracked frame's pixels for the next.

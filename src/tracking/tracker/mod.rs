@@ -290,7 +290,6 @@ impl Tracker {
         let due =
             may_be_keyframe && keyframe_selection::is_due(&self.map, &features, &found, self.motion.reference, &self.rig.config);
         let is_held = found.is_held();
-        let dense = frame.dense.clone().filter(|_| found.inliers < PIXELS_KEPT_BELOW);
         let Localised { camera_from_world, landmarks, inliers, .. } = found;
         let camera_from_reference = self.map.keyframes[self.motion.reference].relative(&camera_from_world);
         let sightings = if is_held { Sightings::new(&features, &landmarks, &self.map, &self.rig) } else { Sightings::default() };
@@ -302,7 +301,7 @@ impl Tracker {
         let image_due = may_be_keyframe && !due && is_held && self.is_image_due(motion);
         self.motion.last = Some(LastFrame { features, camera_from_world, landmarks });
         let new_keyframe = match (due, image_due) {
-            (true, _) => self.make_keyframe(frame, dense, is_held, &mut times)?,
+            (true, _) => self.make_keyframe(frame, inliers, is_held, &mut times)?,
             (false, true) => self.make_image_only(),
             (false, false) => None,
         };
@@ -316,11 +315,11 @@ impl Tracker {
         })
     }
 
-    /// Makes the frame that was just tracked a keyframe. `dense`: its pixels, where landmarks are few. `held`: by landmarks, instead of by all pixels.
+    /// Makes the frame that was just tracked a keyframe. `held`: by landmarks, instead of by all pixels.
     fn make_keyframe(
         &mut self,
         frame: &ExtractedFrame,
-        dense: Option<Arc<DenseFrame>>,
+        inliers: usize,
         held: bool,
         times: &mut StageTimes,
     ) -> Result<Option<NewKeyframe>, TrackingError> {
@@ -328,8 +327,12 @@ impl Tracker {
         let Some(LastFrame { features, camera_from_world, landmarks }) = self.motion.last.take() else { return Ok(None) };
         let clock = Instant::now();
         let root = self.map.keyframes[self.motion.reference].root;
+        let dense = frame.dense.clone().filter(|_| inliers < PIXELS_KEPT_BELOW);
+        let weak = dense.as_ref().filter(|_| inliers < FEW_INLIERS);
+        let relative_poses = weak.map_or(Vec::new(), |dense| self.relative_poses(dense, &camera_from_world, &landmarks));
+        let held = held || !relative_poses.is_empty();
         let keyframe = Keyframe::new(frame.index, frame.timestamp_s, camera_from_world, features.clone());
-        let keyframe = Keyframe { root, landmarks, dense, ..keyframe };
+        let keyframe = Keyframe { root, landmarks, dense, relative_poses, ..keyframe };
         let id = insertion::insert_keyframe(&mut self.map, keyframe, &self.rig);
         triangulation::triangulate_with_neighbours(&mut self.map, id, &self.rig);
         insertion::fuse_with_neighbours(&mut self.map, id, &self.rig);
