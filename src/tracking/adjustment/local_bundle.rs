@@ -15,25 +15,34 @@ use crate::tracking::rig::Rig;
 use crate::tracking::solvers::bundle::{BundleObservation, BundleProblem};
 use crate::tracking::solvers::depth_bias::{BiasPrior, DepthBias};
 use crate::tracking::solvers::relative_pose::RelativePose;
-use crate::tracking::solvers::residual::InlierClass;
+use crate::tracking::solvers::residual::{InlierClass, Measurement};
 
 /// Keyframes that share fewer landmarks than this are not moved together.
 const MIN_SHARED: usize = 15;
 /// Keyframes that hold the window in place, at most; bounds the time.
 const MAX_FIXED: usize = 40;
 
+/// A frame between keyframes that holds landmarks as well.
+#[derive(Clone, Debug)]
+pub struct FrameView {
+    pub camera_from_world: Se3,
+    /// Landmarks and where they were measured.
+    pub seen: Vec<(usize, Measurement)>,
+}
+
 /// A part of the map to be adjusted: the problem, and what its numbers mean.
 #[derive(Clone, Debug, Default)]
 pub struct Adjustment {
     pub problem: BundleProblem,
-    /// The keyframe of each pose.
+    /// The keyframe of each pose, but for frames, whose poses follow the free keyframes'.
     keyframes: Vec<usize>,
+    free_keyframes: usize,
     /// Keyframes beside these that go rigidly with the one that they share most landmarks with.
     carried: Vec<usize>,
     /// The landmark of each point.
     landmarks: Vec<usize>,
-    /// The observation of each observation.
-    observations: Vec<Observation>,
+    /// The keyframe's observation of each observation; `None` for those of frames.
+    observations: Vec<Option<Observation>>,
     /// Keyframes in the map when it was made, and corrections of the whole until then.
     known: usize,
     corrections: usize,
@@ -74,7 +83,43 @@ impl Adjustment {
         let keyframes: Vec<usize> = free.iter().chain(fixed).copied().collect();
         let (problem, observations) = make_problem(map, &keyframes, free.len(), &landmarks, rig);
         let (known, corrections) = (map.keyframes.len(), map.corrections);
-        Some(Self { problem, keyframes, carried: Vec::new(), landmarks, observations, known, corrections })
+        Some(Self {
+            problem,
+            keyframes,
+            free_keyframes: free.len(),
+            carried: Vec::new(),
+            landmarks,
+            observations,
+            known,
+            corrections,
+        })
+    }
+
+    /// With frames beside the keyframes. Their poses are unknowns too, which the map does not take in.
+    #[must_use]
+    pub fn with_frames(mut self, frames: &[FrameView]) -> Self {
+        let problem = &mut self.problem;
+        let (first, count) = (problem.free_poses, frames.len());
+        let shift = |pose: &mut usize| *pose += if *pose >= first { count } else { 0 };
+        problem.observations.iter_mut().for_each(|o| shift(&mut o.pose));
+        problem.relative_poses.iter_mut().for_each(|r| [&mut r.current, &mut r.reference].into_iter().for_each(shift));
+        problem.poses.splice(first..first, frames.iter().map(|frame| frame.camera_from_world));
+        problem.free_poses += count;
+        let place: BTreeMap<usize, usize> = self.landmarks.iter().enumerate().map(|(point, l)| (*l, point)).collect();
+        let of_keyframes_count = problem.observations.len();
+        let of_keyframes = problem.observations.drain(..).zip(self.observations.drain(..));
+        let of_frames = frames.iter().enumerate().flat_map(|(k, frame)| {
+            let seen = frame.seen.iter().filter_map(|(l, measurement)| Some((*place.get(l)?, *measurement)));
+            seen.map(move |(point, measurement)| (BundleObservation::new(first + k, point, measurement), None))
+        });
+        let mut all: Vec<(BundleObservation, Option<Observation>)> = of_keyframes.chain(of_frames).collect();
+        all.sort_by_key(|(o, _)| o.point);
+        // They err as the keyframes beside them do: the prior counts as much as without them.
+        if let Some(prior) = &mut self.problem.bias_prior {
+            prior.information *= all.len() as f64 / of_keyframes_count.max(1) as f64;
+        }
+        (self.problem.observations, self.observations) = all.into_iter().unzip();
+        self
     }
 
     /// With the bias of measured depth among the unknowns.
@@ -105,7 +150,7 @@ impl Adjustment {
     /// Takes the result into the map; returns the keyframes that may have moved, in ascending order. Those that came since go
     /// rigidly with the one that they share most with, as do those that were left out. What hangs on a keyframe goes with it.
     pub fn apply(&self, map: &mut Map, config: &TrackingConfig) -> Vec<usize> {
-        let free = &self.keyframes[..self.problem.free_poses];
+        let free = &self.keyframes[..self.free_keyframes];
         let mut before: BTreeMap<usize, Se3> = BTreeMap::new();
         for (k, pose) in free.iter().zip(&self.problem.poses) {
             if map.is_culled(*k) {
@@ -131,6 +176,7 @@ impl Adjustment {
             }
         }
         for (o, observation) in self.problem.observations.iter().zip(&self.observations) {
+            let Some(observation) = observation else { continue };
             let landmark = self.landmarks[o.point];
             let seen = map.keyframes[observation.keyframe].landmarks.get(observation.feature);
             let is_seen = seen == Some(&Some(landmark)) && map.is_alive_since(landmark, self.known);
@@ -182,7 +228,7 @@ fn make_problem(
     free_poses: usize,
     landmarks: &[usize],
     rig: &Rig,
-) -> (BundleProblem, Vec<Observation>) {
+) -> (BundleProblem, Vec<Option<Observation>>) {
     let place: BTreeMap<usize, usize> = keyframes.iter().enumerate().map(|(i, k)| (*k, i)).collect();
     let mut problem = BundleProblem {
         poses: keyframes.iter().map(|k| map.keyframes[*k].camera_from_world).collect(),
@@ -204,9 +250,8 @@ fn make_problem(
         for observation in &map.landmarks[*l].observations {
             let Some(&pose) = place.get(&observation.keyframe) else { continue };
             let measurement = rig.biased_measurement(&map.keyframes[observation.keyframe].features.features[observation.feature]);
-            let class = if measurement.inverse_depth.is_some() { InlierClass::Full } else { InlierClass::PixelOnly };
-            problem.observations.push(BundleObservation { pose, point, measurement, class });
-            observations.push(*observation);
+            problem.observations.push(BundleObservation::new(pose, point, measurement));
+            observations.push(Some(*observation));
         }
     }
     (problem, observations)
@@ -219,7 +264,7 @@ mod tests {
     use crate::tracking::loop_closing::tests::drifted;
     use crate::tracking::map::sparse_map::{Keyframe, LandmarkState};
     use crate::tracking::solvers::residual::tests::PINHOLE;
-    use nalgebra::{Point3, Vector6};
+    use nalgebra::{Matrix6, Point3, Vector6};
 
     #[test]
     fn a_result_is_taken_into_a_map_that_has_gone_on() {
@@ -247,5 +292,62 @@ mod tests {
         assert!(se3::log(&(map.keyframes[newer].camera_from_world * (pose * push).inverse())).norm() < 1e-12);
         assert!((map.position(own) - push.inverse() * Point3::new(1.0, 2.0, 3.0)).norm() < 1e-12);
         assert!(map.landmarks[gone].state == LandmarkState::Removed && map.landmarks[gone].observations.is_empty());
+    }
+
+    #[test]
+    fn frames_are_unknowns_beside_the_keyframes() {
+        let config = TrackingConfig::default();
+        let rig = Rig::new(PINHOLE, config.clone());
+        let mut map = drifted(&Sim3::identity(), true, &config);
+        let truth: Vec<Se3> = map.keyframes.iter().map(|k| k.camera_from_world).collect();
+        let off = |k: usize| se3::exp(&(Vector6::new(0.01, -0.005, 0.01, 0.003, 0.002, -0.004) * (0.5 - (k % 3) as f64)));
+        // Each sees what a keyframe does, from where that is in truth.
+        let frame = |k: usize| {
+            let keyframe = &map.keyframes[k];
+            let pairs = keyframe.features.features.iter().zip(&keyframe.landmarks);
+            FrameView {
+                camera_from_world: off(k + 1) * truth[k],
+                seen: pairs.filter_map(|(f, l)| Some(((*l)?, rig.biased_measurement(f)))).collect(),
+            }
+        };
+        let frames: Vec<FrameView> = (1..5).map(frame).collect();
+        (1..truth.len()).for_each(|k| map.set_pose(k, off(k) * truth[k]));
+        let mut all = Adjustment::of_all(&map, 0, usize::MAX, &rig).unwrap().with_frames(&frames);
+        all.solve(&PINHOLE, 10);
+        all.apply(&mut map, &config);
+        let error = |pose: &Se3, k: usize| se3::log(&(pose * truth[k].inverse())).norm();
+        let worst = (1..truth.len()).map(|k| error(&map.keyframes[k].camera_from_world, k)).fold(0.0, f64::max);
+        assert!(worst < 1e-3, "{worst}");
+        for (k, pose) in (1..5).zip(&all.problem.poses[all.free_keyframes..all.problem.free_poses]) {
+            assert!(error(pose, k) < 1e-3, "{k}: {}", error(pose, k));
+        }
+    }
+
+    #[test]
+    fn a_keyframe_without_landmarks_goes_where_its_relative_pose_puts_it() {
+        let config = TrackingConfig::default();
+        let rig = Rig::new(PINHOLE, config.clone());
+        let mut map = drifted(&Sim3::identity(), true, &config);
+        let reference = map.keyframes.len() - 1;
+        let mut bare = map.keyframes[reference].clone();
+        bare.landmarks.fill(None);
+        let current_from_reference = se3::exp(&Vector6::new(0.1, 0.02, -0.05, 0.01, -0.04, 0.02));
+        let relative = |current, information| {
+            let information = Matrix6::identity() * information;
+            vec![RelativePose { current, reference, current_from_reference, information }]
+        };
+        let tied = map.push(Keyframe { relative_poses: relative(reference + 1, 1e4), ..bare.clone() });
+        let untied = map.push(bare);
+        let adjustments = [Adjustment::of_window(&map, tied, &rig), Adjustment::of_all(&map, 0, usize::MAX, &rig)];
+        for adjustment in adjustments {
+            let mut adjustment = adjustment.unwrap();
+            let mut map = map.clone();
+            adjustment.solve(&PINHOLE, 10);
+            adjustment.apply(&mut map, &config);
+            let pose = |k: usize| map.keyframes[k].camera_from_world;
+            let found = pose(tied) * pose(reference).inverse();
+            assert!(se3::log(&(found * current_from_reference.inverse())).norm() < 1e-4, "{found}");
+        }
+        assert!(Adjustment::of_window(&map, untied, &rig).is_none());
     }
 }

@@ -26,6 +26,14 @@ pub struct BundleObservation {
     pub class: InlierClass,
 }
 
+impl BundleObservation {
+    /// Trusted as far as it was measured.
+    pub fn new(pose: usize, point: usize, measurement: Measurement) -> Self {
+        let class = if measurement.inverse_depth.is_some() { InlierClass::Full } else { InlierClass::PixelOnly };
+        Self { pose, point, measurement, class }
+    }
+}
+
 /// Bundle adjustment problem.
 #[derive(Clone, Debug, Default)]
 pub struct BundleProblem {

@@ -25,6 +25,8 @@ const TAKEN_IN_SHARE: usize = 4;
 /// Observations up to which the whole submap is adjusted at the end, when no frame waits, and what each takes of host memory.
 const MOST_AT_THE_END: usize = 2_000_000;
 const BYTES_PER_OBSERVATION: u64 = 450;
+/// Frames between keyframes have so many of them, or as many as the keyframes if these have more.
+const MOST_OF_FRAMES: usize = 150_000;
 
 /// The worker, and what it is at.
 #[derive(Debug)]
@@ -113,12 +115,16 @@ impl Tracker {
             return;
         }
         let most = MOST_AT_THE_END.min((self.rig.config.max_host_bytes / BYTES_PER_OBSERVATION) as usize);
-        let all = Adjustment::of_all(&self.map, self.largest_submap(), most, &self.rig);
-        let Some(mut all) = all.map(|all| self.with_bias(all)) else { return };
+        let root = self.largest_submap();
+        let Some(all) = Adjustment::of_all(&self.map, root, most, &self.rig) else { return };
+        let of_keyframes = all.problem.observations.len();
+        let frames = self.frame_views(root, (most - of_keyframes).min(of_keyframes.max(MOST_OF_FRAMES)));
+        let mut all = self.with_bias(all).with_frames(&frames);
         all.solve(&self.rig.pinhole, self.rig.config.bundle_iterations);
         self.rig.depth_bias = all.bias().unwrap_or(self.rig.depth_bias);
         all.apply(&mut self.map, &self.rig.config).into_iter().for_each(|k| self.note_move(k, 1.0));
         self.follow_keyframe();
+        self.unsettle_frames();
     }
 
     /// Has the surroundings of a new keyframe adjusted, now or when the worker is free.
@@ -242,7 +248,7 @@ impl Tracker {
         }
         // One more than there are new ones, so that the map gets below its bound.
         for _ in 0..=keyframes.len() {
-            let most = self.rig.config.max_host_bytes;
+            let most = self.rig.config.max_host_bytes.saturating_sub(self.frame_bytes());
             self.adjusting.thinned = thin(&mut self.map, most, self.adjusting.thinned, |k| self.loops.holds(k), &self.rig.config);
         }
         self.motion.reference = self.map.living(self.motion.reference);

@@ -1,7 +1,8 @@
 //! Frames between keyframes: which of them become image-only keyframes, and their poses once the landmarks that they saw have settled.
 //!
 //! The tracker carries a frame by its reference keyframe. Bundle adjustment moves keyframe and landmarks in different ways; the pose is therefore
-//! solved once more when it is over with both.
+//! solved once more when it is over with both. What frames saw is kept as far as memory allows: the adjustment at the end takes them along,
+//! and all are solved again after it.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -9,6 +10,7 @@ use nalgebra::Vector2;
 
 use super::{Tracker, keyframe_selection};
 use crate::geometry::Se3;
+use crate::tracking::adjustment::local_bundle::FrameView;
 use crate::tracking::features::frame_features::FrameFeatures;
 use crate::tracking::map::sparse_map::{Keyframe, Map, SETTLED_AFTER};
 use crate::tracking::rig::Rig;
@@ -20,6 +22,8 @@ use crate::tracking::{KeyframePose, NewKeyframe};
 const SETTLED_A_FRAME: usize = 2;
 /// Frames that may wait for it: a camera that stands still makes no keyframes.
 const MOST_WAITING: usize = 256;
+/// What settled frames saw takes at most this share of the tracker's host memory.
+const SHARE_OF_HOST_BYTES: u64 = 8;
 /// Share of the landmarks that must still be there, and agree.
 const LEAST_AGREEING: f64 = 0.5;
 
@@ -31,7 +35,7 @@ pub(super) struct Record {
     pub reference: usize,
     /// In the reference keyframe's unit of length.
     pub camera_from_reference: Se3,
-    /// Until its pose is solved again.
+    /// By which its pose is solved again.
     pub sightings: Sightings,
 }
 
@@ -57,8 +61,11 @@ struct Sighting {
 /// What is kept of frames between keyframes.
 #[derive(Debug, Default)]
 pub(super) struct Frames {
-    /// Records before this one have their final poses.
+    /// Records before this one have been solved again.
     settled: usize,
+    /// Of these, one in so many (a power of two; 0 is 1) keeps its sightings, which take so many bytes.
+    kept_every: usize,
+    kept_bytes: usize,
     /// The record of the last keyframe, image-only or not.
     mapped_last: Option<usize>,
     /// Records of image-only keyframes by their references, ascending.
@@ -81,20 +88,32 @@ impl Sightings {
         Self { seen: seen.collect(), known: map.keyframes.len() }
     }
 
-    /// Those whose landmarks are still there.
-    fn observations(&self, map: &Map, rig: &Rig) -> Vec<PoseObservation> {
-        let observation = |s: &Sighting| {
+    fn bytes(&self) -> usize {
+        self.seen.len() * size_of::<Sighting>()
+    }
+
+    /// Landmarks that are still there, and where they were measured.
+    fn measured(&self, map: &Map) -> Vec<(usize, Measurement)> {
+        let measured = |s: &Sighting| {
             let landmark = map.resolve_since(s.landmark as usize, self.known)?;
-            let measured = Measurement {
+            let measurement = Measurement {
                 pixel: Vector2::from(s.pixel.map(f64::from)),
                 inverse_depth: (!s.inverse_depth.is_nan()).then_some(s.inverse_depth.into()),
                 pixel_weight: s.weights[0].into(),
                 depth_weight: s.weights[1].into(),
             };
-            let measurement = measured.without_bias(&rig.pinhole, &rig.depth_bias);
-            Some(PoseObservation { point_in_world: map.position(landmark), measurement })
+            Some((landmark, measurement))
         };
-        self.seen.iter().filter_map(observation).collect()
+        self.seen.iter().filter_map(measured).collect()
+    }
+
+    /// The same with their places, freed of the depth's bias.
+    fn observations(&self, map: &Map, rig: &Rig) -> Vec<PoseObservation> {
+        let observation = |(landmark, measured): (usize, Measurement)| {
+            let measurement = measured.without_bias(&rig.pinhole, &rig.depth_bias);
+            PoseObservation { point_in_world: map.position(landmark), measurement }
+        };
+        self.measured(map).into_iter().map(observation).collect()
     }
 }
 
@@ -110,9 +129,8 @@ impl Record {
 
     /// Solves the pose by the landmarks as they are now; `false` where too few are left or agree.
     fn settle(&mut self, map: &Map, rig: &Rig) -> bool {
-        let sightings = std::mem::take(&mut self.sightings);
-        let found = optimise_pose(&rig.pinhole, &self.pose(map), None, &sightings.observations(map, rig));
-        let needed = (LEAST_AGREEING * sightings.seen.len() as f64).max(rig.config.min_inliers as f64);
+        let found = optimise_pose(&rig.pinhole, &self.pose(map), None, &self.sightings.observations(map, rig));
+        let needed = (LEAST_AGREEING * self.sightings.seen.len() as f64).max(rig.config.min_inliers as f64);
         let agrees = found.inliers as f64 >= needed;
         if agrees {
             self.camera_from_reference = map.keyframes[self.reference].relative(&found.camera_from_world);
@@ -176,6 +194,45 @@ impl Tracker {
         }
     }
 
+    /// Frames between the keyframes of a submap, for bundle adjustment: evenly, with so many observations at most.
+    pub(super) fn frame_views(&self, root: usize, most_observations: usize) -> Vec<FrameView> {
+        let of_submap = |record: &&Record| self.map.keyframes[record.reference].root == root && !record.sightings.seen.is_empty();
+        let records: Vec<&Record> = self.records.iter().filter(of_submap).collect();
+        let observations: usize = records.iter().map(|record| record.sightings.seen.len()).sum();
+        let every = observations.div_ceil(most_observations.max(1)).max(1);
+        let view = |record: &&Record| FrameView {
+            camera_from_world: record.pose(&self.map),
+            seen: record.sightings.measured(&self.map),
+        };
+        records.iter().step_by(every).map(view).collect()
+    }
+
+    /// Lets all frames that kept their sightings be solved once more.
+    pub(super) fn unsettle_frames(&mut self) {
+        (self.frames.settled, self.frames.kept_bytes) = (0, 0);
+    }
+
+    /// Memory of what settled frames saw, bytes.
+    pub(super) fn frame_bytes(&self) -> u64 {
+        self.frames.kept_bytes as u64
+    }
+
+    /// A settled record keeps its sightings, or gives them up; where all together are too many, every other record does.
+    fn keep_or_drop_sightings(&mut self, settled: usize) {
+        let most = (self.rig.config.max_host_bytes / SHARE_OF_HOST_BYTES) as usize;
+        let frames = &mut self.frames;
+        if settled % frames.kept_every.max(1) != 0 {
+            self.records[settled].sightings = Sightings::default();
+        }
+        frames.kept_bytes += self.records[settled].sightings.bytes();
+        while frames.kept_bytes > most {
+            frames.kept_every = 2 * frames.kept_every.max(1);
+            for record in self.records[..=settled].iter_mut().skip(frames.kept_every / 2).step_by(frames.kept_every) {
+                frames.kept_bytes -= std::mem::take(&mut record.sightings).bytes();
+            }
+        }
+    }
+
     fn settle_next(&mut self) {
         let settled = self.frames.settled;
         let record = &mut self.records[settled];
@@ -184,6 +241,7 @@ impl Tracker {
         if moved && self.frames.images_of(record.reference).binary_search(&settled).is_ok() {
             self.frames.moved.insert(settled);
         }
+        self.keep_or_drop_sightings(settled);
         self.frames.settled += 1;
     }
 
@@ -227,7 +285,6 @@ mod tests {
         let error = |record: &Record, map: &Map| se3::log(&(record.pose(map) * truth.inverse())).norm();
         let mut solved = record.clone();
         assert!(solved.settle(&map, &rig) && error(&solved, &map) < 0.2 * error(&record, &map), "{}", error(&solved, &map));
-        assert!(solved.sightings.seen.is_empty());
         // Where most of the landmarks are gone, it stays with its reference.
         let seen: Vec<usize> = map.keyframes[2].landmarks.iter().flatten().copied().collect();
         seen.iter().skip(20).for_each(|landmark| map.remove_landmark(*landmark));
@@ -247,7 +304,34 @@ mod tests {
             tracker.records.push(Record { frame_index, timestamp_s: 0.1, reference: newest, camera_from_reference, sightings });
             tracker.settle_old_frames();
         }
-        let waiting = tracker.records.iter().filter(|record| !record.sightings.seen.is_empty());
-        assert_eq!(waiting.count(), MOST_WAITING);
+        assert_eq!(tracker.records.len() - tracker.frames.settled, MOST_WAITING);
+    }
+
+    #[test]
+    fn what_frames_saw_is_thinned_evenly_where_memory_is_short() {
+        const FRAMES: usize = 100;
+        let mut tracker = tracker(Sensor::Rgbd, &Sim3::identity());
+        let Keyframe { features, landmarks, .. } = &tracker.map.keyframes[2];
+        let sightings = Sightings::new(features, landmarks, &tracker.map, &tracker.rig);
+        let bytes = sightings.bytes() as u64;
+        tracker.rig.config.max_host_bytes = 30 * bytes * SHARE_OF_HOST_BYTES;
+        let record = |frame| Record {
+            frame_index: 1000 + frame,
+            timestamp_s: 0.1,
+            reference: 1,
+            camera_from_reference: Se3::identity(),
+            sightings: sightings.clone(),
+        };
+        tracker.records = (0..FRAMES).map(record).collect();
+        tracker.settle_all_frames();
+        let kept: Vec<usize> = (0..FRAMES).filter(|k| !tracker.records[*k].sightings.seen.is_empty()).collect();
+        assert_eq!(kept, (0..FRAMES).step_by(4).collect::<Vec<_>>());
+        assert_eq!(tracker.frame_bytes(), 25 * bytes);
+        let views = tracker.frame_views(0, 10 * sightings.seen.len());
+        assert_eq!(views.len(), 9, "every third: evenly, at most ten");
+        // Solved again, they keep what they have.
+        tracker.unsettle_frames();
+        tracker.settle_all_frames();
+        assert_eq!(tracker.frame_bytes(), 25 * bytes);
     }
 }

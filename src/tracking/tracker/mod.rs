@@ -258,7 +258,7 @@ impl Tracker {
 
     /// Host memory of the tracker's map, bytes, as `tracking.max_host_bytes` bounds it.
     pub fn map_bytes(&self) -> u64 {
-        self.map.bytes()
+        self.map.bytes() + self.frame_bytes()
     }
 
     /// How many keyframes have not been culled.
