@@ -63,8 +63,8 @@ struct Sighting {
 pub(super) struct Frames {
     /// Records before this one have been solved again.
     settled: usize,
-    /// Of these, one in so many (a power of two; 0 is 1) keeps its sightings, which take so many bytes.
-    kept_every: usize,
+    /// How often the sightings that these keep were halved in number, and their bytes.
+    halvings: u32,
     kept_bytes: usize,
     /// The record of the last keyframe, image-only or not.
     mapped_last: Option<usize>,
@@ -221,15 +221,16 @@ impl Tracker {
     fn keep_or_drop_sightings(&mut self, settled: usize) {
         let most = (self.rig.config.max_host_bytes / SHARE_OF_HOST_BYTES) as usize;
         let frames = &mut self.frames;
-        if settled % frames.kept_every.max(1) != 0 {
+        if !settled.is_multiple_of(1 << frames.halvings) {
             self.records[settled].sightings = Sightings::default();
         }
         frames.kept_bytes += self.records[settled].sightings.bytes();
-        while frames.kept_bytes > most {
-            frames.kept_every = 2 * frames.kept_every.max(1);
-            for record in self.records[..=settled].iter_mut().skip(frames.kept_every / 2).step_by(frames.kept_every) {
+        while frames.kept_bytes > most && 1 << frames.halvings <= settled {
+            let kept_every = 1 << frames.halvings;
+            for record in self.records[..=settled].iter_mut().skip(kept_every).step_by(2 * kept_every) {
                 frames.kept_bytes -= std::mem::take(&mut record.sightings).bytes();
             }
+            frames.halvings += 1;
         }
     }
 
