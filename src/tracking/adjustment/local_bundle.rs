@@ -106,7 +106,7 @@ impl Adjustment {
         problem.poses.splice(first..first, frames.iter().map(|frame| frame.camera_from_world));
         problem.free_poses += count;
         let place: BTreeMap<usize, usize> = self.landmarks.iter().enumerate().map(|(point, l)| (*l, point)).collect();
-        let of_keyframes_count = problem.observations.len();
+        let by_keyframes = problem.observations.len();
         let of_keyframes = problem.observations.drain(..).zip(self.observations.drain(..));
         let of_frames = frames.iter().enumerate().flat_map(|(k, frame)| {
             let seen = frame.seen.iter().filter_map(|(l, measurement)| Some((*place.get(l)?, *measurement)));
@@ -116,7 +116,7 @@ impl Adjustment {
         all.sort_by_key(|(o, _)| o.point);
         // They err as the keyframes beside them do: the prior counts as much as without them.
         if let Some(prior) = &mut self.problem.bias_prior {
-            prior.information *= all.len() as f64 / of_keyframes_count.max(1) as f64;
+            prior.information *= all.len() as f64 / by_keyframes.max(1) as f64;
         }
         (self.problem.observations, self.observations) = all.into_iter().unzip();
         self

@@ -118,7 +118,7 @@ impl Tracker {
         let root = self.largest_submap();
         let Some(all) = Adjustment::of_all(&self.map, root, most, &self.rig) else { return };
         let of_keyframes = all.problem.observations.len();
-        let frames = self.frame_views(root, (most - of_keyframes).min(of_keyframes.max(MOST_OF_FRAMES)));
+        let frames = self.frame_views(root, most.saturating_sub(of_keyframes).min(of_keyframes.max(MOST_OF_FRAMES)));
         let mut all = self.with_bias(all).with_frames(&frames);
         all.solve(&self.rig.pinhole, self.rig.config.bundle_iterations);
         self.rig.depth_bias = all.bias().unwrap_or(self.rig.depth_bias);

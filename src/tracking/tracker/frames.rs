@@ -10,6 +10,7 @@ use nalgebra::Vector2;
 
 use super::{Tracker, keyframe_selection};
 use crate::geometry::Se3;
+use crate::sequence::Sensor;
 use crate::tracking::adjustment::local_bundle::FrameView;
 use crate::tracking::features::frame_features::FrameFeatures;
 use crate::tracking::map::sparse_map::{Keyframe, Map, SETTLED_AFTER};
@@ -196,6 +197,9 @@ impl Tracker {
 
     /// Frames between the keyframes of a submap, for bundle adjustment: evenly, with so many observations at most.
     pub(super) fn frame_views(&self, root: usize, most_observations: usize) -> Vec<FrameView> {
+        if !self.adjusts_frames() {
+            return Vec::new();
+        }
         let of_submap = |record: &&Record| self.map.keyframes[record.reference].root == root && !record.sightings.seen.is_empty();
         let records: Vec<&Record> = self.records.iter().filter(of_submap).collect();
         let observations: usize = records.iter().map(|record| record.sightings.seen.len()).sum();
@@ -205,6 +209,11 @@ impl Tracker {
             seen: record.sightings.measured(&self.map),
         };
         records.iter().step_by(every).map(view).collect()
+    }
+
+    /// Whether the adjustment at the end takes frames along. Without measured depth, they change nothing.
+    fn adjusts_frames(&self) -> bool {
+        self.sensor != Sensor::Mono
     }
 
     /// Lets all frames that kept their sightings be solved once more.
@@ -220,8 +229,9 @@ impl Tracker {
     /// A settled record keeps its sightings, or gives them up; where all together are too many, every other record does.
     fn keep_or_drop_sightings(&mut self, settled: usize) {
         let most = (self.rig.config.max_host_bytes / SHARE_OF_HOST_BYTES) as usize;
+        let kept = self.adjusts_frames();
         let frames = &mut self.frames;
-        if !settled.is_multiple_of(1 << frames.halvings) {
+        if !(kept && settled.is_multiple_of(1 << frames.halvings)) {
             self.records[settled].sightings = Sightings::default();
         }
         frames.kept_bytes += self.records[settled].sightings.bytes();
@@ -265,7 +275,6 @@ impl Tracker {
 mod tests {
     use super::*;
     use crate::geometry::{Sim3, se3};
-    use crate::sequence::Sensor;
     use crate::tracking::tracker::adjusting::tests::tracker;
     use nalgebra::Vector6;
 
