@@ -343,5 +343,11 @@ mod tests {
         tracker.unsettle_frames();
         tracker.settle_all_frames();
         assert_eq!(tracker.frame_bytes(), 25 * bytes);
+        // Without depth, they are of no use.
+        tracker.sensor = Sensor::Mono;
+        assert!(tracker.frame_views(0, usize::MAX).is_empty());
+        tracker.unsettle_frames();
+        tracker.settle_all_frames();
+        assert_eq!(tracker.frame_bytes(), 0);
     }
 }
