@@ -56,7 +56,7 @@ impl Adjustment {
     }
 
     /// Global bundle adjustment of the submap that begins with `root`; `None` if it has more observations than that. Few landmarks would tear a
-    /// keyframe from where all pixels put it: such a keyframe is carried.
+    /// keyframe from where all pixels put it: such a keyframe is carried, unless relative poses hold it.
     pub fn of_all(map: &Map, root: usize, most_observations: usize, rig: &Rig) -> Option<Self> {
         let mut observations = 0;
         for keyframe in map.living_in(root) {

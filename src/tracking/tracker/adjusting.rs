@@ -25,7 +25,7 @@ const TAKEN_IN_SHARE: usize = 4;
 /// Observations up to which the whole submap is adjusted at the end, when no frame waits, and what each takes of host memory.
 const MOST_AT_THE_END: usize = 2_000_000;
 const BYTES_PER_OBSERVATION: u64 = 450;
-/// Frames between keyframes have so many of them, or as many as the keyframes if these have more.
+/// Observations of frames between keyframes in that adjustment, at most; more if the keyframes have more.
 const MOST_OF_FRAMES: usize = 150_000;
 
 /// The worker, and what it is at.
@@ -58,7 +58,7 @@ struct UnderWay {
 #[derive(Clone, Copy, Debug)]
 struct Waiting {
     keyframe: usize,
-    /// Whether landmarks hold it, instead of all pixels.
+    /// Whether landmarks or relative poses hold it.
     held: bool,
 }
 

@@ -1,5 +1,5 @@
 //! RGB-D frames with few landmarks: the alignment of all pixels is a prior of the pose, and without landmarks the pose. Not across a gap, where a
-//! false minimum looks like a pose.
+//! false minimum looks like a pose. A frame that becomes a keyframe is aligned to older keyframes too: relative poses for bundle adjustment.
 
 use std::sync::Arc;
 

@@ -1,8 +1,8 @@
 //! Frames between keyframes: which of them become image-only keyframes, and their poses once the landmarks that they saw have settled.
 //!
 //! The tracker carries a frame by its reference keyframe. Bundle adjustment moves keyframe and landmarks in different ways; the pose is therefore
-//! solved once more when it is over with both. What frames saw is kept as far as memory allows: the adjustment at the end takes them along,
-//! and all are solved again after it.
+//! solved once more when it is over with both. With measured depth, their observations are kept as far as memory allows: the
+//! adjustment at the end includes them, and the poses are solved again after it.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -211,7 +211,7 @@ impl Tracker {
         records.iter().step_by(every).map(view).collect()
     }
 
-    /// Whether the adjustment at the end takes frames along. Without measured depth, they change nothing.
+    /// Whether the adjustment at the end includes frames. Without measured depth, they change nothing.
     fn adjusts_frames(&self) -> bool {
         self.sensor != Sensor::Mono
     }
