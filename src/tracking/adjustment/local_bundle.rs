@@ -28,6 +28,8 @@ pub struct FrameView {
     pub camera_from_world: Se3,
     /// Landmarks and where they were measured.
     pub seen: Vec<(usize, Measurement)>,
+    /// Its pose relative to a keyframe, which `reference` names.
+    pub relative_pose: Option<RelativePose>,
 }
 
 /// A part of the map to be adjusted: the problem, and what its numbers mean.
@@ -105,6 +107,14 @@ impl Adjustment {
         problem.relative_poses.iter_mut().for_each(|r| [&mut r.current, &mut r.reference].into_iter().for_each(shift));
         problem.poses.splice(first..first, frames.iter().map(|frame| frame.camera_from_world));
         problem.free_poses += count;
+        let place: BTreeMap<usize, usize> = self.keyframes.iter().enumerate().map(|(pose, k)| (*k, pose)).collect();
+        let relative_pose = |(k, frame): (usize, &FrameView)| {
+            let relative = frame.relative_pose?;
+            let mut reference = *place.get(&relative.reference)?;
+            shift(&mut reference);
+            Some(RelativePose { current: first + k, reference, ..relative })
+        };
+        problem.relative_poses.extend(frames.iter().enumerate().filter_map(relative_pose));
         let place: BTreeMap<usize, usize> = self.landmarks.iter().enumerate().map(|(point, l)| (*l, point)).collect();
         let by_keyframes = problem.observations.len();
         let of_keyframes = problem.observations.drain(..).zip(self.observations.drain(..));
@@ -308,9 +318,15 @@ mod tests {
             FrameView {
                 camera_from_world: off(k + 1) * truth[k],
                 seen: pairs.filter_map(|(f, l)| Some(((*l)?, rig.biased_measurement(f)))).collect(),
+                relative_pose: None,
             }
         };
-        let frames: Vec<FrameView> = (1..5).map(frame).collect();
+        let mut frames: Vec<FrameView> = (1..5).map(frame).collect();
+        // One sees nothing, and is where its pixels put it beside the last keyframe, which holds it in another place of the problem.
+        let (last, relative) = (truth.len() - 1, se3::exp(&Vector6::new(0.1, 0.02, -0.05, 0.01, -0.04, 0.02)));
+        let information = Matrix6::identity() * 1e4;
+        let of_last = RelativePose { current: 0, reference: last, current_from_reference: relative, information };
+        frames.push(FrameView { camera_from_world: truth[last], seen: Vec::new(), relative_pose: Some(of_last) });
         (1..truth.len()).for_each(|k| map.set_pose(k, off(k) * truth[k]));
         let mut all = Adjustment::of_all(&map, 0, usize::MAX, &rig).unwrap().with_frames(&frames);
         all.solve(&PINHOLE, 10);
@@ -318,9 +334,11 @@ mod tests {
         let error = |pose: &Se3, k: usize| se3::log(&(pose * truth[k].inverse())).norm();
         let worst = (1..truth.len()).map(|k| error(&map.keyframes[k].camera_from_world, k)).fold(0.0, f64::max);
         assert!(worst < 1e-3, "{worst}");
-        for (k, pose) in (1..5).zip(&all.problem.poses[all.free_keyframes..all.problem.free_poses]) {
+        let of_frames = &all.problem.poses[all.free_keyframes..all.problem.free_poses];
+        for (k, pose) in (1..5).zip(of_frames) {
             assert!(error(pose, k) < 1e-3, "{k}: {}", error(pose, k));
         }
+        assert!(error(&(relative.inverse() * of_frames[4]), last) < 1e-3, "{}", of_frames[4]);
     }
 
     #[test]

@@ -8,9 +8,12 @@ use nalgebra::{Matrix6, SymmetricEigen, Vector3, Vector6};
 use crate::geometry::{Pinhole, Se3, se3};
 use crate::tracking::features::dense_frame::DenseFrame;
 use crate::tracking::solvers::pose::PosePrior;
+use crate::tracking::solvers::relative_pose::RelativePose;
 
 /// Halvings of a frame's size, coarsest first, with the iterations on each.
 const LEVELS: [(u32, usize); 4] = [(3, 20), (2, 16), (1, 12), (0, 10)];
+/// Levels by which guesses are compared.
+const COARSE: usize = 2;
 /// Standard deviations of inverse depth among neighbouring pixels (1/metres; less than a lone keypoint's, which may lie on an edge), and of
 /// brightness, grey levels.
 const INVERSE_DEPTH_SIGMA: f64 = 0.004;
@@ -21,7 +24,8 @@ const HUBER: f64 = 1.5;
 const GATE: f64 = 8.0;
 /// Cosine up to which normals agree.
 const NORMAL_COSINE: f64 = 0.6;
-const CONVERGED: f64 = 1e-6;
+/// Steps below this times the side of a pixel have converged.
+const CONVERGED: f64 = 1e-5;
 /// Share of the points in view that must agree.
 const MIN_AGREEMENT: f64 = 0.55;
 /// And of all points.
@@ -31,15 +35,29 @@ const MIN_RESEMBLANCE: f64 = 0.6;
 /// The least information about any direction of motion, per point: (1/m)² or (1/rad)² over the squared residuals' scale.
 const MIN_INFORMATION: f64 = 0.05;
 /// Neighbouring pixels err together: so many say as much as one.
-const ERRING_TOGETHER: f64 = 300.0;
+const ERRING_TOGETHER: f64 = 1000.0;
 
 /// A level of a dense frame with what follows from it.
 struct Level {
     pinhole: Pinhole,
     grey: Vec<f64>,
-    /// In the camera frame; `None` where depth is unknown.
-    points: Vec<Option<Vector3<f64>>>,
-    normals: Vec<Option<Vector3<f64>>>,
+    /// `None` where depth is unknown, at the border and over edges.
+    surfaces: Vec<Option<Surface>>,
+}
+
+/// What a pixel shows, in the camera frame.
+#[derive(Clone, Copy, Debug)]
+struct Surface {
+    point: Vector3<f64>,
+    /// Towards the camera.
+    normal: Vector3<f64>,
+}
+
+impl Surface {
+    /// Its point in the frame of the camera at a pose relative to this one.
+    fn seen_from(&self, pose: &Se3) -> Vector3<f64> {
+        pose.rotation * self.point + pose.translation.vector
+    }
 }
 
 impl Level {
@@ -66,20 +84,20 @@ impl Level {
             let nearest = block().map(|s| f64::from(frame.depth[s])).filter(|d| *d > 0.0).min_by(f64::total_cmp);
             points.push(nearest.map(|d| pinhole.unproject(&nalgebra::Vector2::new(x as f64, y as f64), d)));
         }
-        let normals = (0..points.len()).map(|i| normal(&points, i, width)).collect();
-        Self { pinhole, grey, points, normals }
+        let surface = |i: usize| Some(Surface { point: points[i]?, normal: normal(&points, i, width)? });
+        Self { pinhole, grey, surfaces: (0..width * height).map(surface).collect() }
     }
 
     /// Brightness between pixels and its gradient; `None` at the border.
     fn brightness(&self, x: f64, y: f64) -> Option<(f64, f64, f64)> {
         let (width, height) = (self.pinhole.width as usize, self.pinhole.height as usize);
-        let (column, row) = (x.floor(), y.floor());
         // NaN is not inside.
-        if !(column >= 0.0 && row >= 0.0 && column < (width - 1) as f64 && row < (height - 1) as f64) {
+        if !(x >= 0.0 && y >= 0.0 && x < (width - 1) as f64 && y < (height - 1) as f64) {
             return None;
         }
-        let (u, v) = (x - column, y - row);
-        let at = row as usize * width + column as usize;
+        let (column, row) = (x as usize, y as usize);
+        let (u, v) = (x - column as f64, y - row as f64);
+        let at = row * width + column;
         let [a, b, c, d] = [self.grey[at], self.grey[at + 1], self.grey[at + width], self.grey[at + width + 1]];
         let value = (1.0 - v) * ((1.0 - u) * a + u * b) + v * ((1.0 - u) * c + u * d);
         Some((value, (1.0 - v) * (b - a) + v * (d - c), (1.0 - u) * (c - a) + u * (d - b)))
@@ -115,13 +133,20 @@ pub struct Aligned {
 impl Aligned {
     /// What it says of the current pose, given that of the reference.
     pub fn prior(&self, reference_from_world: &Se3) -> PosePrior {
-        PosePrior { camera_from_world: self.current_from_reference * reference_from_world, information: self.information }
+        self.relative_pose(0, 0).prior(reference_from_world)
+    }
+
+    /// The same as a factor between two poses, by their places.
+    pub fn relative_pose(&self, current: usize, reference: usize) -> RelativePose {
+        let Self { current_from_reference, information, .. } = *self;
+        RelativePose { current, reference, current_from_reference, information }
     }
 }
 
 /// Normal equations of one level at one pose.
 #[derive(Clone, Debug, Default)]
 struct Sums {
+    /// Its lower triangle.
     hessian: Matrix6<f64>,
     gradient: Vector6<f64>,
     cost: f64,
@@ -130,37 +155,29 @@ struct Sums {
     agree: usize,
 }
 
-/// The pose of `current` relative to `reference`, from the best of some initial guesses; `None` where the two do not agree, or the scene
-/// does not hold the pose (a single plane without texture).
+/// The pose of `current` relative to `reference`, from some initial guesses: the first by their costs on the coarse levels that holds on all;
+/// `None` where the two do not agree, or the scene does not hold the pose (a single plane without texture).
 pub fn align(reference: &DenseFrame, current: &DenseFrame, guesses: &[Se3]) -> Option<Aligned> {
-    let mut best: Option<(f64, Aligned)> = None;
-    let levels: Vec<LevelPair> = LEVELS
-        .iter()
-        .map(|(halvings, steps)| LevelPair {
-            reference: Level::new(reference, *halvings),
-            current: Level::new(current, *halvings),
-            steps: *steps,
-            huber: HUBER * f64::from(1 << halvings),
-        })
-        .collect();
-    for guess in guesses {
-        let mut pose = *guess;
-        for level in &levels {
-            pose = descend(level, pose);
-        }
-        let LevelPair { reference, current, huber, .. } = &levels[levels.len() - 1];
-        let sums = linearise(reference, current, &pose, *huber);
-        let agreement = sums.agree as f64 / sums.in_view.max(1) as f64;
-        let overlap = sums.agree as f64 / sums.points.max(1) as f64;
-        let information = SymmetricEigen::new(sums.hessian / sums.agree.max(1) as f64).eigenvalues.min();
-        let alike = resemblance(reference, current, &pose) >= MIN_RESEMBLANCE;
-        let held = alike && agreement >= MIN_AGREEMENT && overlap >= MIN_OVERLAP && information >= MIN_INFORMATION;
-        let cost = sums.cost / sums.in_view.max(1) as f64;
-        if held && best.as_ref().is_none_or(|(least, _)| cost < *least) {
-            best = Some((cost, Aligned { current_from_reference: pose, overlap, information: sums.hessian / ERRING_TOGETHER }));
-        }
-    }
-    best.map(|(_, aligned)| aligned)
+    let level = |(halvings, steps): &(u32, usize)| LevelPair {
+        reference: Level::new(reference, *halvings),
+        current: Level::new(current, *halvings),
+        steps: *steps,
+        scale: f64::from(1 << halvings),
+    };
+    let coarse: Vec<LevelPair> = LEVELS[..COARSE].iter().map(level).collect();
+    let rough = |guess: &Se3| {
+        let pose = coarse.iter().fold(*guess, |pose, level| level.descend(pose));
+        let sums = coarse[COARSE - 1].linearise(&pose);
+        (sums.cost / sums.in_view.max(1) as f64, pose)
+    };
+    let mut rough: Vec<(f64, Se3)> = guesses.iter().map(rough).collect();
+    rough.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let fine: Vec<LevelPair> = LEVELS[COARSE..].iter().map(level).collect();
+    let refine = |pose: Se3| {
+        let pose = fine.iter().fold(pose, |pose, level| level.descend(pose));
+        fine[fine.len() - 1].held(pose)
+    };
+    rough.into_iter().find_map(|(_, pose)| refine(pose))
 }
 
 /// Both frames at one pyramid level, and the level's schedule.
@@ -169,64 +186,85 @@ struct LevelPair {
     current: Level,
     /// Most Gauss-Newton steps.
     steps: usize,
-    /// Threshold of the robust loss, standard deviations.
-    huber: f64,
+    /// Side of a pixel, those of the finest level.
+    scale: f64,
 }
 
-/// Gauss-Newton with damping on one level.
-fn descend(level: &LevelPair, initial: Se3) -> Se3 {
-    let mut pose = initial;
-    for _ in 0..level.steps {
-        let sums = linearise(&level.reference, &level.current, &pose, level.huber);
-        let mut damped = sums.hessian;
-        (0..6).for_each(|k| damped[(k, k)] += 1e-3 * sums.hessian[(k, k)] + 1e-3);
-        let Some(step) = damped.cholesky().map(|c| c.solve(&-sums.gradient)) else { break };
-        pose = se3::exp(&step) * pose;
-        if step.norm() < CONVERGED {
-            break;
+impl LevelPair {
+    /// Gauss-Newton with damping.
+    fn descend(&self, initial: Se3) -> Se3 {
+        let mut pose = initial;
+        for _ in 0..self.steps {
+            let sums = self.linearise(&pose);
+            let mut damped = sums.hessian;
+            (0..6).for_each(|k| damped[(k, k)] += 1e-3 * sums.hessian[(k, k)] + 1e-3);
+            let Some(step) = damped.cholesky().map(|c| c.solve(&-sums.gradient)) else { break };
+            pose = se3::exp(&step) * pose;
+            if step.norm() < CONVERGED * self.scale {
+                break;
+            }
         }
+        pose.rotation.renormalize();
+        pose
     }
-    pose.rotation.renormalize();
-    pose
-}
 
-fn linearise(reference: &Level, current: &Level, pose: &Se3, huber: f64) -> Sums {
-    let mut sums = Sums::default();
-    let offset = brightness_offset(reference, current, pose);
-    let pinhole = &current.pinhole;
-    for (i, point) in reference.points.iter().enumerate() {
-        let (Some(point), Some(normal)) = (point, reference.normals[i]) else { continue };
-        sums.points += 1;
-        let p = pose * nalgebra::Point3::from(*point);
-        let Some(pixel) = pinhole.project(&p.coords).filter(|pixel| pinhole.contains(pixel, 0.0)) else { continue };
-        let at = pixel.y.round() as usize * pinhole.width as usize + pixel.x.round() as usize;
-        let (Some(target), Some(facing)) = (current.points[at], current.normals[at]) else { continue };
-        sums.in_view += 1;
-        // Distance from the plane, in standard deviations of what the sensor measures there.
-        let sigma = INVERSE_DEPTH_SIGMA * target.z * target.z;
-        let distance = facing.dot(&(p.coords - target)) / sigma.max(1e-4);
-        if distance.abs() > GATE * huber || (pose.rotation * normal).dot(&facing) < NORMAL_COSINE {
-            sums.cost += GATE * huber * huber;
-            continue;
-        }
-        sums.agree += 1;
-        let row = by_pose(&p.coords, &(facing / sigma.max(1e-4)));
-        sums.add(&row, distance, huber);
-        let Some((value, gx, gy)) = current.brightness(pixel.x, pixel.y) else { continue };
-        let error = (value - reference.grey[i] - offset) / GREY_SIGMA;
-        let iz = 1.0 / p.z;
-        let (fx, fy) = (gx * pinhole.fx * iz, gy * pinhole.fy * iz);
-        let gradient = Vector3::new(fx, fy, -(fx * p.x + fy * p.y) * iz) / GREY_SIGMA;
-        sums.add(&by_pose(&p.coords, &gradient), error, huber);
+    /// The pose, if the frames agree there and hold it.
+    fn held(&self, pose: Se3) -> Option<Aligned> {
+        let sums = self.linearise(&pose);
+        let mut information = sums.hessian;
+        information.fill_upper_triangle_with_lower_triangle();
+        let agreement = sums.agree as f64 / sums.in_view.max(1) as f64;
+        let overlap = sums.agree as f64 / sums.points.max(1) as f64;
+        let least = SymmetricEigen::new(information / sums.agree.max(1) as f64).eigenvalues.min();
+        let alike = || resemblance(&self.reference, &self.current, &pose) >= MIN_RESEMBLANCE;
+        let held = agreement >= MIN_AGREEMENT && overlap >= MIN_OVERLAP && least >= MIN_INFORMATION && alike();
+        held.then(|| Aligned { current_from_reference: pose, overlap, information: information / ERRING_TOGETHER })
     }
-    sums
+
+    fn linearise(&self, pose: &Se3) -> Sums {
+        let Self { reference, current, .. } = self;
+        let huber = HUBER * self.scale;
+        let mut sums = Sums::default();
+        let offset = brightness_offset(reference, current, pose);
+        let (pinhole, rotation) = (&current.pinhole, pose.rotation.to_rotation_matrix());
+        for (i, surface) in reference.surfaces.iter().enumerate() {
+            let Some(Surface { point, normal }) = surface else { continue };
+            sums.points += 1;
+            let p = rotation * point + pose.translation.vector;
+            let Some(pixel) = pinhole.project(&p).filter(|pixel| pinhole.contains(pixel, 0.0)) else { continue };
+            let at = (pixel.y + 0.5) as usize * pinhole.width as usize + (pixel.x + 0.5) as usize;
+            let Some(Surface { point: target, normal: facing }) = &current.surfaces[at] else { continue };
+            sums.in_view += 1;
+            // Distance from the plane, in standard deviations of what the sensor measures there.
+            let weight = 1.0 / (INVERSE_DEPTH_SIGMA * target.z * target.z).max(1e-4);
+            let distance = facing.dot(&(p - target)) * weight;
+            if distance.abs() > GATE * huber || (rotation * normal).dot(facing) < NORMAL_COSINE {
+                sums.cost += GATE * huber * huber;
+                continue;
+            }
+            sums.agree += 1;
+            sums.add(&by_pose(&p, &(facing * weight)), distance, huber);
+            let Some((value, gx, gy)) = current.brightness(pixel.x, pixel.y) else { continue };
+            let error = (value - reference.grey[i] - offset) / GREY_SIGMA;
+            let iz = 1.0 / p.z;
+            let (fx, fy) = (gx * pinhole.fx * iz, gy * pinhole.fy * iz);
+            let gradient = Vector3::new(fx, fy, -(fx * p.x + fy * p.y) * iz) / GREY_SIGMA;
+            sums.add(&by_pose(&p, &gradient), error, huber);
+        }
+        sums
+    }
 }
 
 impl Sums {
     fn add(&mut self, row: &Vector6<f64>, residual: f64, huber: f64) {
         let weight = if residual.abs() <= huber { 1.0 } else { huber / residual.abs() };
-        self.hessian += weight * row * row.transpose();
-        self.gradient += weight * residual * row;
+        for column in 0..6 {
+            let weighted = weight * row[column];
+            for k in column..6 {
+                self.hessian[(k, column)] += weighted * row[k];
+            }
+            self.gradient[column] += weighted * residual;
+        }
         self.cost += weight * residual * residual;
     }
 }
@@ -240,10 +278,9 @@ fn by_pose(p: &Vector3<f64>, g: &Vector3<f64>) -> Vector6<f64> {
 /// Correlation of the reference's brightness with what the current frame shows there; 0 where either is blank.
 fn resemblance(reference: &Level, current: &Level, pose: &Se3) -> f64 {
     let mut pairs: Vec<(f64, f64)> = Vec::new();
-    for (point, grey) in reference.points.iter().zip(&reference.grey) {
-        let Some(point) = point else { continue };
-        let p = pose * nalgebra::Point3::from(*point);
-        let Some(pixel) = current.pinhole.project(&p.coords) else { continue };
+    for (surface, grey) in reference.surfaces.iter().zip(&reference.grey) {
+        let Some(surface) = surface else { continue };
+        let Some(pixel) = current.pinhole.project(&surface.seen_from(pose)) else { continue };
         pairs.extend(current.brightness(pixel.x, pixel.y).map(|(value, ..)| (*grey, value)));
     }
     let count = pairs.len().max(1) as f64;
@@ -259,15 +296,14 @@ fn resemblance(reference: &Level, current: &Level, pose: &Se3) -> f64 {
 /// Median difference in brightness: the exposure may have changed.
 fn brightness_offset(reference: &Level, current: &Level, pose: &Se3) -> f64 {
     let mut differences: Vec<f64> = Vec::new();
-    for (i, point) in reference.points.iter().enumerate().step_by(3) {
-        let Some(point) = point else { continue };
-        let p = pose * nalgebra::Point3::from(*point);
-        let Some(pixel) = current.pinhole.project(&p.coords) else { continue };
+    for (i, surface) in reference.surfaces.iter().enumerate().step_by(3) {
+        let Some(surface) = surface else { continue };
+        let Some(pixel) = current.pinhole.project(&surface.seen_from(pose)) else { continue };
         let Some((value, ..)) = current.brightness(pixel.x, pixel.y) else { continue };
         differences.push(value - reference.grey[i]);
     }
-    differences.sort_by(f64::total_cmp);
-    differences.get(differences.len() / 2).copied().unwrap_or_default()
+    let middle = differences.len() / 2;
+    if differences.is_empty() { 0.0 } else { *differences.select_nth_unstable_by(middle, f64::total_cmp).1 }
 }
 
 #[cfg(test)]
@@ -318,6 +354,12 @@ pub mod tests {
         let error = se3::log(&(found.current_from_reference * truth.inverse()));
         assert!(error.norm() < 5e-3, "{error}");
         assert!(found.overlap > 0.5);
+        // Guesses that lead nowhere do not stand in the way of one that does.
+        let astray =
+            [se3::exp(&Vector6::new(0.0, 0.0, 0.0, 0.0, 1.2, 0.0)), se3::exp(&Vector6::new(0.0, 0.0, 0.0, 0.9, 0.0, 0.4))];
+        assert!(align(&reference, &current, &astray).is_none());
+        let among = align(&reference, &current, &[astray[0], Se3::identity(), astray[1]]).unwrap();
+        assert!(se3::log(&(among.current_from_reference * truth.inverse())).norm() < 5e-3);
     }
 
     #[test]

@@ -13,6 +13,7 @@ use crate::tracking::localisation::pnp::{pose_from_view, similar_keyframes};
 use crate::tracking::map::sparse_map::Map;
 use crate::tracking::rig::Rig;
 use crate::tracking::solvers::pose::{PoseObservation, PosePrior, median_squared, optimise_pose};
+use crate::tracking::solvers::relative_pose::RelativePose;
 use crate::tracking::solvers::residual::InlierClass;
 
 /// Search radius around last frame's points, pixels at the finest level, widened in turn until enough are found.
@@ -65,6 +66,8 @@ pub struct Localised {
     pub rough: bool,
     /// What all pixels say of it, where landmarks are few.
     pub prior: Option<PosePrior>,
+    /// The same relative to a keyframe, where that is known; `reference` is its name.
+    pub relative_pose: Option<RelativePose>,
 }
 
 impl Localised {
@@ -196,6 +199,7 @@ impl Context<'_> {
             median_squared: 0.0,
             rough: true,
             prior: Some(prior),
+            relative_pose: None,
         };
         self.in_local_map(frame, &blank, reference)
     }
@@ -233,6 +237,7 @@ impl Context<'_> {
             median_squared: median_squared(&self.rig.pinhole, &estimate.camera_from_world, &observations),
             rough: false,
             prior,
+            relative_pose: None,
         }
     }
 

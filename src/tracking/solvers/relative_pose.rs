@@ -6,6 +6,7 @@
 use nalgebra::{Matrix6, Vector6};
 
 use crate::geometry::{Se3, se3};
+use crate::tracking::solvers::pose::PosePrior;
 
 /// Squared error, whitened, beyond which it pulls less and less: 95% of six coordinates are below.
 const HUBER_SQUARED: f64 = 12.592;
@@ -29,6 +30,11 @@ pub struct RelativeTerms {
 }
 
 impl RelativePose {
+    /// What it says of the current pose, given that of the reference.
+    pub fn prior(&self, reference_from_world: &Se3) -> PosePrior {
+        PosePrior { camera_from_world: self.current_from_reference * reference_from_world, information: self.information }
+    }
+
     fn error(&self, poses: &[Se3]) -> Vector6<f64> {
         let found = poses[self.current] * poses[self.reference].inverse();
         se3::log(&(found * self.current_from_reference.inverse()))

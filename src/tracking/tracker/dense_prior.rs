@@ -7,7 +7,7 @@ use super::Tracker;
 use crate::geometry::Se3;
 use crate::tracking::features::dense_frame::DenseFrame;
 use crate::tracking::front_end::ExtractedFrame;
-use crate::tracking::localisation::dense_alignment::{Aligned, align};
+use crate::tracking::localisation::dense_alignment::align;
 use crate::tracking::localisation::localise::{Context, LastFrame, Localised};
 use crate::tracking::map::tally::distinct;
 use crate::tracking::solvers::relative_pose::RelativePose;
@@ -20,25 +20,27 @@ const KEYFRAME_OVERLAP: f64 = 0.5;
 const RELATIVE_TO: usize = 3;
 
 impl Tracker {
-    /// The frame's pose from all its pixels and the landmarks that agree: against the last frame, then against the newest keyframe, which drifts
-    /// less, and once more where that is the last frame: the best of three guesses may be a false minimum.
+    /// The frame's pose from all its pixels and the landmarks that agree: against the newest keyframe, which drifts less than the last frame does,
+    /// or against the last frame where too little of that keyframe is in view.
     pub(super) fn localise_densely(&mut self, frame: &ExtractedFrame, last: &LastFrame, guess: Option<Se3>) -> Option<Localised> {
         if self.lostness.frames_lost > MAX_FRAMES_BRIDGED {
             return None;
         }
         let (dense, before) = (frame.dense.as_ref()?, self.dense.last.as_ref()?);
-        let mut guesses = vec![self.expected_motion(), Se3::identity()];
-        guesses.extend(guess.map(|pose| pose * last.camera_from_world.inverse()));
-        let mut prior = align(before, dense, &guesses)?.prior(&last.camera_from_world);
-        if let Some((keyframe, view)) = &self.dense.keyframe {
-            let pose = self.map.keyframes[*keyframe].camera_from_world;
-            let guess = prior.camera_from_world * pose.inverse();
-            if let Some(found) = align(view, dense, &[guess]).filter(|found| found.overlap >= KEYFRAME_OVERLAP) {
-                prior = found.prior(&pose);
-            }
-        }
+        let mut guesses = vec![self.expected_motion() * last.camera_from_world, last.camera_from_world];
+        guesses.extend(guess);
+        let from = |reference: &Se3| guesses.iter().map(|pose| pose * reference.inverse()).collect::<Vec<Se3>>();
+        let to_keyframe = self.dense.keyframe.as_ref().and_then(|(keyframe, view)| {
+            let found = align(view, dense, &from(&self.map.keyframes[*keyframe].camera_from_world))?;
+            (found.overlap >= KEYFRAME_OVERLAP).then(|| found.relative_pose(self.map.keyframes.len(), *keyframe))
+        });
+        let prior = match &to_keyframe {
+            Some(relative) => relative.prior(&self.map.keyframes[relative.reference].camera_from_world),
+            None => align(before, dense, &from(&last.camera_from_world))?.prior(&last.camera_from_world),
+        };
         let mut context = Context { map: &mut self.map, rig: &self.rig };
-        Some(context.with_prior(&frame.features, prior, self.motion.reference))
+        let found = context.with_prior(&frame.features, prior, self.motion.reference);
+        Some(Localised { relative_pose: to_keyframe, ..found })
     }
 
     /// Poses of the frame that becomes a keyframe relative to older ones, by all pixels: those before it and those that share most landmarks with it.
@@ -56,8 +58,7 @@ impl Tracker {
             let keyframe = &map.keyframes[reference];
             let guess = camera_from_world * keyframe.camera_from_world.inverse();
             let found = align(keyframe.dense.as_ref()?, dense, &[guess]).filter(|found| found.overlap >= KEYFRAME_OVERLAP)?;
-            let Aligned { current_from_reference, information, .. } = found;
-            Some(RelativePose { current: map.keyframes.len(), reference, current_from_reference, information })
+            Some(found.relative_pose(map.keyframes.len(), reference))
         };
         references.filter_map(relative).collect()
     }

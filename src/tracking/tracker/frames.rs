@@ -15,7 +15,8 @@ use crate::tracking::adjustment::local_bundle::FrameView;
 use crate::tracking::features::frame_features::FrameFeatures;
 use crate::tracking::map::sparse_map::{Keyframe, Map, SETTLED_AFTER};
 use crate::tracking::rig::Rig;
-use crate::tracking::solvers::pose::{PoseObservation, optimise_pose};
+use crate::tracking::solvers::pose::{PoseObservation, PosePrior, optimise_pose};
+use crate::tracking::solvers::relative_pose::RelativePose;
 use crate::tracking::solvers::residual::Measurement;
 use crate::tracking::{KeyframePose, NewKeyframe};
 
@@ -46,6 +47,8 @@ pub(super) struct Sightings {
     seen: Vec<Sighting>,
     /// How many keyframes there were: later landmarks may have taken the places of these.
     known: usize,
+    /// The frame's pose relative to a keyframe by all pixels, where landmarks were few.
+    relative_pose: Option<Box<RelativePose>>,
 }
 
 /// A landmark where a frame saw it.
@@ -86,11 +89,15 @@ impl Sightings {
                 weights: [measured.pixel_weight as f32, measured.depth_weight as f32],
             })
         });
-        Self { seen: seen.collect(), known: map.keyframes.len() }
+        Self { seen: seen.collect(), known: map.keyframes.len(), relative_pose: None }
+    }
+
+    pub fn with_relative_pose(self, relative_pose: Option<RelativePose>) -> Self {
+        Self { relative_pose: relative_pose.map(Box::new), ..self }
     }
 
     fn bytes(&self) -> usize {
-        self.seen.len() * size_of::<Sighting>()
+        self.seen.len() * size_of::<Sighting>() + self.relative_pose.as_deref().map_or(0, size_of_val)
     }
 
     /// Landmarks that are still there, and where they were measured.
@@ -106,6 +113,17 @@ impl Sightings {
             Some((landmark, measurement))
         };
         self.seen.iter().filter_map(measured).collect()
+    }
+
+    /// The relative pose, unless its keyframe was culled.
+    fn living_relative_pose(&self, map: &Map) -> Option<&RelativePose> {
+        self.relative_pose.as_deref().filter(|relative| map.living.contains(&relative.reference))
+    }
+
+    /// What it says of the frame's pose.
+    fn prior(&self, map: &Map) -> Option<PosePrior> {
+        let relative = self.living_relative_pose(map)?;
+        Some(relative.prior(&map.keyframes[relative.reference].camera_from_world))
     }
 
     /// The same with their places, freed of the depth's bias.
@@ -130,7 +148,8 @@ impl Record {
 
     /// Solves the pose by the landmarks as they are now; `false` where too few are left or agree.
     fn settle(&mut self, map: &Map, rig: &Rig) -> bool {
-        let found = optimise_pose(&rig.pinhole, &self.pose(map), None, &self.sightings.observations(map, rig));
+        let prior = self.sightings.prior(map);
+        let found = optimise_pose(&rig.pinhole, &self.pose(map), prior.as_ref(), &self.sightings.observations(map, rig));
         let needed = (LEAST_AGREEING * self.sightings.seen.len() as f64).max(rig.config.min_inliers as f64);
         let agrees = found.inliers as f64 >= needed;
         if agrees {
@@ -207,6 +226,7 @@ impl Tracker {
         let view = |record: &&Record| FrameView {
             camera_from_world: record.pose(&self.map),
             seen: record.sightings.measured(&self.map),
+            relative_pose: record.sightings.living_relative_pose(&self.map).copied(),
         };
         records.iter().step_by(every).map(view).collect()
     }
@@ -276,7 +296,7 @@ mod tests {
     use super::*;
     use crate::geometry::{Sim3, se3};
     use crate::tracking::tracker::adjusting::tests::tracker;
-    use nalgebra::Vector6;
+    use nalgebra::{Matrix6, Vector6};
 
     #[test]
     fn a_frame_is_solved_again_by_the_landmarks_as_they_are() {
@@ -295,6 +315,16 @@ mod tests {
         let error = |record: &Record, map: &Map| se3::log(&(record.pose(map) * truth.inverse())).norm();
         let mut solved = record.clone();
         assert!(solved.settle(&map, &rig) && error(&solved, &map) < 0.2 * error(&record, &map), "{}", error(&solved, &map));
+        // Its pixels pull it towards where they put it.
+        let by_pixels = RelativePose {
+            current: 0,
+            reference: 1,
+            current_from_reference: off * truth * map.keyframes[1].camera_from_world.inverse(),
+            information: Matrix6::identity() * 1e6,
+        };
+        let sightings = record.sightings.clone().with_relative_pose(Some(by_pixels));
+        let mut pulled = Record { sightings, ..record.clone() };
+        assert!(pulled.settle(&map, &rig) && error(&pulled, &map) > 2.0 * error(&solved, &map), "{}", error(&pulled, &map));
         // Where most of the landmarks are gone, it stays with its reference.
         let seen: Vec<usize> = map.keyframes[2].landmarks.iter().flatten().copied().collect();
         seen.iter().skip(20).for_each(|landmark| map.remove_landmark(*landmark));

@@ -40,10 +40,8 @@ use crate::tracking::solvers::depth_bias::DepthBias;
 use crate::tracking::worker::Worker;
 use crate::tracking::{KeyframePose, NewKeyframe, StageTimes, TrackedFrame, TrackingConfig, TrackingError, TrackingState};
 
-/// Below this many inliers, the alignment of all pixels is a prior of the pose, where there is depth.
-const FEW_INLIERS: usize = 100;
-/// Keyframes with fewer inliers keep their pixels, by which a place is recognised.
-const PIXELS_KEPT_BELOW: usize = 200;
+/// Below this many inliers, the alignment of all pixels is a prior of the pose, where there is depth. Such keyframes keep their pixels.
+const FEW_INLIERS: usize = 200;
 /// Frames with fewer inliers say nothing of the noise.
 const NOISE_INLIERS: usize = 30;
 /// Without depth, keyframes further apart are worth more: a window then spans a wider baseline, which is all that fixes the points.
@@ -290,9 +288,12 @@ impl Tracker {
         let due =
             may_be_keyframe && keyframe_selection::is_due(&self.map, &features, &found, self.motion.reference, &self.rig.config);
         let is_held = found.is_held();
-        let Localised { camera_from_world, landmarks, inliers, .. } = found;
+        let Localised { camera_from_world, landmarks, inliers, relative_pose, .. } = found;
         let camera_from_reference = self.map.keyframes[self.motion.reference].relative(&camera_from_world);
-        let sightings = if is_held { Sightings::new(&features, &landmarks, &self.map, &self.rig) } else { Sightings::default() };
+        let sightings = match is_held {
+            true => Sightings::new(&features, &landmarks, &self.map, &self.rig).with_relative_pose(relative_pose),
+            false => Sightings::default(),
+        };
         self.record(frame, self.motion.reference, camera_from_reference, sightings);
         let motion = |before: &Se3| {
             let between = [before, &camera_from_world];
@@ -327,9 +328,9 @@ impl Tracker {
         let Some(LastFrame { features, camera_from_world, landmarks }) = self.motion.last.take() else { return Ok(None) };
         let clock = Instant::now();
         let root = self.map.keyframes[self.motion.reference].root;
-        let dense = frame.dense.clone().filter(|_| inliers < PIXELS_KEPT_BELOW);
-        let weak = dense.as_ref().filter(|_| inliers < FEW_INLIERS);
-        let relative_poses = weak.map_or(Vec::new(), |dense| self.relative_poses(dense, &camera_from_world, &landmarks));
+        let dense = frame.dense.clone().filter(|_| inliers < FEW_INLIERS);
+        let relative_poses =
+            dense.as_ref().map_or(Vec::new(), |dense| self.relative_poses(dense, &camera_from_world, &landmarks));
         let held = held || !relative_poses.is_empty();
         let keyframe = Keyframe::new(frame.index, frame.timestamp_s, camera_from_world, features.clone());
         let keyframe = Keyframe { root, landmarks, dense, relative_poses, ..keyframe };
