@@ -168,7 +168,8 @@ pub fn align(reference: &DenseFrame, current: &DenseFrame, guesses: &[Se3]) -> O
     let rough = |guess: &Se3| {
         let pose = coarse.iter().fold(*guess, |pose, level| level.descend(pose));
         let sums = coarse[COARSE - 1].linearise(&pose);
-        (sums.cost / sums.in_view.max(1) as f64, pose)
+        let cost = if sums.in_view == 0 { f64::INFINITY } else { sums.cost / sums.in_view as f64 };
+        (cost, pose)
     };
     let mut rough: Vec<(f64, Se3)> = guesses.iter().map(rough).collect();
     rough.sort_by(|a, b| a.0.total_cmp(&b.0));

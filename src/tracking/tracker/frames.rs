@@ -80,7 +80,9 @@ pub(super) struct Frames {
 
 impl Sightings {
     pub fn new(features: &FrameFeatures, landmarks: &[Option<usize>], map: &Map, rig: &Rig) -> Self {
-        let seen = features.features.iter().zip(landmarks).filter_map(|(feature, landmark)| {
+        // No larger than needed: they stay for as long as the recording lasts.
+        let mut seen = Vec::with_capacity(landmarks.iter().flatten().count());
+        seen.extend(features.features.iter().zip(landmarks).filter_map(|(feature, landmark)| {
             let measured = rig.biased_measurement(feature);
             Some(Sighting {
                 landmark: u32::try_from((*landmark)?).ok()?,
@@ -88,8 +90,8 @@ impl Sightings {
                 inverse_depth: measured.inverse_depth.map_or(f32::NAN, |inverse| inverse as f32),
                 weights: [measured.pixel_weight as f32, measured.depth_weight as f32],
             })
-        });
-        Self { seen: seen.collect(), known: map.keyframes.len(), relative_pose: None }
+        }));
+        Self { seen, known: map.keyframes.len(), relative_pose: None }
     }
 
     pub fn with_relative_pose(self, relative_pose: Option<RelativePose>) -> Self {
