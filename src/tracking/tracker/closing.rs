@@ -33,8 +33,9 @@ pub(super) struct Closing {
     /// A correction is under way, or waits for the worker.
     correcting: bool,
     waiting: Option<Correction>,
-    /// Keyframes whose windows are still to be adjusted.
+    /// Keyframes whose windows are still to be adjusted, and whether all at once was not tried yet: in a large map, that takes long to rule out.
     unsettled: VecDeque<usize>,
+    untried: bool,
 }
 
 #[derive(Debug)]
@@ -57,7 +58,7 @@ impl Closing {
             Job::Adjust(adjustment, _) => adjustment.solve(&pinhole, steps),
         };
         let worker = Worker::start("closing", solve)?;
-        Ok(Self { worker, due: None, next: 0, correcting: false, waiting: None, unsettled: VecDeque::new() })
+        Ok(Self { worker, due: None, next: 0, correcting: false, waiting: None, unsettled: VecDeque::new(), untried: false })
     }
 }
 
@@ -143,6 +144,7 @@ impl Tracker {
         self.follow_keyframe();
         let living = moved.iter().map(|m| m.keyframe).filter(|k| !self.map.is_culled(*k));
         self.closing.unsettled = living.step_by(WINDOW_EVERY).collect();
+        self.closing.untried = true;
     }
 
     /// Gives the thread its next job: a correction, or bundle adjustment of what the last one moved.
@@ -166,7 +168,9 @@ impl Tracker {
         }
         let first = self.closing.unsettled.front().copied()?;
         let root = self.map.keyframes[first].root;
-        if let Some(all) = Adjustment::of_all(&self.map, root, MOST_AT_A_LOOP, &self.rig) {
+        if std::mem::take(&mut self.closing.untried)
+            && let Some(all) = Adjustment::of_all(&self.map, root, MOST_AT_A_LOOP, &self.rig)
+        {
             self.closing.unsettled.clear();
             let later = 1 + all.problem.observations.len() / OBSERVATIONS_A_FRAME;
             return Some((Job::Adjust(all, Extent::All), later));
