@@ -107,10 +107,10 @@ impl Adjustment {
         problem.relative_poses.iter_mut().for_each(|r| [&mut r.current, &mut r.reference].into_iter().for_each(shift));
         problem.poses.splice(first..first, frames.iter().map(|frame| frame.camera_from_world));
         problem.free_poses += count;
-        let place: BTreeMap<usize, usize> = self.keyframes.iter().enumerate().map(|(pose, k)| (*k, pose)).collect();
+        let pose_of: BTreeMap<usize, usize> = self.keyframes.iter().enumerate().map(|(pose, k)| (*k, pose)).collect();
         let relative_pose = |(k, frame): (usize, &FrameView)| {
             let relative = frame.relative_pose?;
-            let mut reference = *place.get(&relative.reference)?;
+            let mut reference = *pose_of.get(&relative.reference)?;
             shift(&mut reference);
             Some(RelativePose { current: first + k, reference, ..relative })
         };

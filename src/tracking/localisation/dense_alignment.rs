@@ -136,7 +136,7 @@ impl Aligned {
         self.relative_pose(0, 0).prior(reference_from_world)
     }
 
-    /// The same as a factor between two poses, by their places.
+    /// The same as a factor between two poses, which their places name.
     pub fn relative_pose(&self, current: usize, reference: usize) -> RelativePose {
         let Self { current_from_reference, information, .. } = *self;
         RelativePose { current, reference, current_from_reference, information }
@@ -155,8 +155,8 @@ struct Sums {
     agree: usize,
 }
 
-/// The pose of `current` relative to `reference`, from some initial guesses: the first by their costs on the coarse levels that holds on all;
-/// `None` where the two do not agree, or the scene does not hold the pose (a single plane without texture).
+/// The pose of `current` relative to `reference`; `None` where the two do not agree, or the scene does not hold the pose (a single plane without
+/// texture). Initial guesses are tried in the order of their costs on the coarse levels, until a pose is held.
 pub fn align(reference: &DenseFrame, current: &DenseFrame, guesses: &[Se3]) -> Option<Aligned> {
     let level = |(halvings, steps): &(u32, usize)| LevelPair {
         reference: Level::new(reference, *halvings),

@@ -33,9 +33,10 @@ pub(super) struct Closing {
     /// A correction is under way, or waits for the worker.
     correcting: bool,
     waiting: Option<Correction>,
-    /// Keyframes whose windows are still to be adjusted, and whether all at once was not tried yet: in a large map, that takes long to rule out.
+    /// Keyframes whose windows are still to be adjusted.
     unsettled: VecDeque<usize>,
-    untried: bool,
+    /// Whether they may still be adjusted all at once. A large map takes long to rule it out, so it is tried once.
+    all_at_once: bool,
 }
 
 #[derive(Debug)]
@@ -58,7 +59,7 @@ impl Closing {
             Job::Adjust(adjustment, _) => adjustment.solve(&pinhole, steps),
         };
         let worker = Worker::start("closing", solve)?;
-        Ok(Self { worker, due: None, next: 0, correcting: false, waiting: None, unsettled: VecDeque::new(), untried: false })
+        Ok(Self { worker, due: None, next: 0, correcting: false, waiting: None, unsettled: VecDeque::new(), all_at_once: false })
     }
 }
 
@@ -144,7 +145,7 @@ impl Tracker {
         self.follow_keyframe();
         let living = moved.iter().map(|m| m.keyframe).filter(|k| !self.map.is_culled(*k));
         self.closing.unsettled = living.step_by(WINDOW_EVERY).collect();
-        self.closing.untried = true;
+        self.closing.all_at_once = true;
     }
 
     /// Gives the thread its next job: a correction, or bundle adjustment of what the last one moved.
@@ -168,7 +169,7 @@ impl Tracker {
         }
         let first = self.closing.unsettled.front().copied()?;
         let root = self.map.keyframes[first].root;
-        if std::mem::take(&mut self.closing.untried)
+        if std::mem::take(&mut self.closing.all_at_once)
             && let Some(all) = Adjustment::of_all(&self.map, root, MOST_AT_A_LOOP, &self.rig)
         {
             self.closing.unsettled.clear();
