@@ -373,8 +373,8 @@ fn load_depth(camera: &Camera, path: &Path) -> Result<DepthImage, SequenceError>
     check_size(camera, path, raw.dimensions())?;
     let metres_per_unit = (1.0 / camera.depth_units_per_metre) as f32;
     let (width, height) = raw.dimensions();
-    let metres = |units| if units == NOT_MEASURED { 0.0 } else { f32::from(units) * metres_per_unit };
-    Ok(DepthImage { width, height, metres: raw.into_raw().into_iter().map(metres).collect() })
+    let metres = |units: &u16| if *units == NOT_MEASURED { 0.0 } else { f32::from(*units) * metres_per_unit };
+    Ok(DepthImage { width, height, metres: raw.as_raw().iter().map(metres).collect() })
 }
 
 fn check_size(camera: &Camera, path: &Path, (found_width, found_height): (u32, u32)) -> Result<(), SequenceError> {

@@ -6,6 +6,7 @@ use std::time::Instant;
 
 use image::RgbImage;
 use nalgebra::Vector2;
+use pulp::{Arch, Simd, WithSimd};
 
 use crate::geometry::Camera;
 use crate::sequence::{DepthImage, Frame, Sensor};
@@ -140,8 +141,23 @@ type MeasuredDepth = Option<(f64, f64)>;
 
 /// Rec. 601 luma in integers, row-major.
 fn luma(image: &RgbImage) -> Vec<u8> {
-    let of = |[r, g, b]: [u8; 3]| ((u32::from(r) * 77 + u32::from(g) * 150 + u32::from(b) * 29 + 128) >> 8) as u8;
-    image.pixels().map(|p| of(p.0)).collect()
+    Arch::new().dispatch(Luma(image.as_raw().as_chunks().0))
+}
+
+struct Luma<'a>(&'a [[u8; 3]]);
+
+impl WithSimd for Luma<'_> {
+    type Output = Vec<u8>;
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _: S) -> Vec<u8> {
+        let mut grey = vec![0; self.0.len()];
+        for (grey, [r, g, b]) in grey.iter_mut().zip(self.0) {
+            // The weights' sum is 256: 16 bits hold the largest value.
+            *grey = ((u16::from(*r) * 77 + u16::from(*g) * 150 + u16::from(*b) * 29 + 128) >> 8) as u8;
+        }
+        grey
+    }
 }
 
 /// The depth at a recorded pixel, unless it is out of range, not finite, or on an edge.
@@ -168,6 +184,19 @@ fn depth_at(depth: &DepthImage, pixel: &Vector2<f64>, config: &TrackingConfig) -
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn grey_is_the_weighted_mean_of_the_channels() {
+        let colour = |i: u32| image::Rgb([(i * 37 % 256) as u8, (i * 91 % 256) as u8, (i * 53 % 256) as u8]);
+        let mut picture = RgbImage::from_fn(37, 11, |x, y| colour(x + 37 * y));
+        picture.put_pixel(36, 10, image::Rgb([255; 3]));
+        let grey = luma(&picture);
+        for (value, image::Rgb([r, g, b])) in grey.iter().zip(picture.pixels()) {
+            let expected = 0.299 * f64::from(*r) + 0.587 * f64::from(*g) + 0.114 * f64::from(*b);
+            assert!((f64::from(*value) - expected).abs() < 1.2, "{value} for {r} {g} {b}");
+        }
+        assert_eq!((grey.len(), grey[36 + 37 * 10]), (37 * 11, 255));
+    }
 
     #[test]
     fn depth_on_an_edge_or_out_of_range_is_left_out() {

@@ -16,12 +16,19 @@ pub struct Rig {
     pub depth_bias: DepthBias,
     /// As the frames so far show it.
     pub pixel_noise: PixelNoise,
+    octave_scales: Vec<f64>,
 }
 
 impl Rig {
     /// A rig whose depth is not known to err.
     pub fn new(pinhole: Pinhole, config: TrackingConfig) -> Self {
-        Self { pinhole, depth_bias: DepthBias::default(), pixel_noise: PixelNoise::new(config.pixel_sigma), config }
+        Self {
+            pinhole,
+            depth_bias: DepthBias::default(),
+            pixel_noise: PixelNoise::new(config.pixel_sigma),
+            octave_scales: (0..config.pyramid_levels).map(|octave| config.pyramid_scale.powi(octave as i32)).collect(),
+            config,
+        }
     }
 
     /// A feature's measurement, freed of the depth's bias, with weights from the noise model.
@@ -41,6 +48,6 @@ impl Rig {
 
     /// Scale of a pyramid octave relative to the finest: `pyramid_scale` to the power of `octave`.
     pub fn octave_scale(&self, octave: u8) -> f64 {
-        self.config.pyramid_scale.powi(octave.into())
+        self.octave_scales[usize::from(octave)]
     }
 }

@@ -1,5 +1,7 @@
 //! The features of one frame as the tracker uses them: undistorted, with depth, in a grid for searches around a pixel.
 
+use std::ops::RangeInclusive;
+
 use nalgebra::{Point3, Vector2};
 
 use crate::geometry::Pinhole;
@@ -38,10 +40,18 @@ pub struct FrameFeatures {
     rows: usize,
     /// `cells[c]..cells[c + 1]` are the places in `by_cell` of cell `c`'s features.
     cells: Vec<u32>,
-    /// Pixels and indices: a search reads them in a row.
-    by_cell: Vec<(Vector2<f64>, u32)>,
+    /// A search reads them in a row.
+    by_cell: Vec<Place>,
     /// Relative standard deviation of depth up to which a measurement makes a point.
     max_depth_error: f64,
+}
+
+/// Where a feature is.
+#[derive(Clone, Copy, Debug, Default)]
+struct Place {
+    pixel: Vector2<f64>,
+    index: u32,
+    octave: u8,
 }
 
 /// The error up to which a feature's depth makes a point: larger where fewer than [`FEWEST_POINTS`] are certain.
@@ -62,15 +72,20 @@ impl FrameFeatures {
         let columns = (f64::from(pinhole.width) / CELL_PIXELS).ceil().max(1.0) as usize;
         let rows = (f64::from(pinhole.height) / CELL_PIXELS).ceil().max(1.0) as usize;
         let cell_of = |pixel: &Vector2<f64>| cell(pixel.y, rows) * columns + cell(pixel.x, columns);
-        let mut by_cell: Vec<(Vector2<f64>, u32)> = features.iter().map(|f| f.pixel).zip(0..).collect();
-        // Stable: features of one cell stay in their order.
-        by_cell.sort_by_key(|(pixel, _)| cell_of(pixel));
         let mut cells = vec![0u32; columns * rows + 1];
         for feature in &features {
             cells[cell_of(&feature.pixel) + 1] += 1;
         }
         for c in 1..cells.len() {
             cells[c] += cells[c - 1];
+        }
+        // Features of one cell stay in their order.
+        let mut next = cells.clone();
+        let mut by_cell = vec![Place::default(); features.len()];
+        for (feature, index) in features.iter().zip(0..) {
+            let place = &mut next[cell_of(&feature.pixel)];
+            by_cell[*place as usize] = Place { pixel: feature.pixel, index, octave: feature.octave };
+            *place += 1;
         }
         let max_depth_error = max_depth_error(&features);
         Self { features, columns, rows, cells, by_cell, max_depth_error }
@@ -80,15 +95,15 @@ impl FrameFeatures {
         self.features.len()
     }
 
-    /// Calls `visit` with the index of every feature within `radius` pixels of `centre`, in a fixed order.
-    pub fn within(&self, centre: &Vector2<f64>, radius: f64, mut visit: impl FnMut(usize)) {
+    /// Calls `visit` with the index of every feature of some octaves within `radius` pixels of `centre`, in a fixed order.
+    pub fn within(&self, centre: &Vector2<f64>, radius: f64, octaves: &RangeInclusive<u8>, mut visit: impl FnMut(usize)) {
         let (x0, x1) = (cell(centre.x - radius, self.columns), cell(centre.x + radius, self.columns));
         let (y0, y1) = (cell(centre.y - radius, self.rows), cell(centre.y + radius, self.rows));
         for y in y0..=y1 {
             let span = self.cells[y * self.columns + x0] as usize..self.cells[y * self.columns + x1 + 1] as usize;
-            for (pixel, index) in &self.by_cell[span] {
-                if (pixel - centre).norm_squared() <= radius * radius {
-                    visit(*index as usize);
+            for place in &self.by_cell[span] {
+                if octaves.contains(&place.octave) && (place.pixel - centre).norm_squared() <= radius * radius {
+                    visit(place.index as usize);
                 }
             }
         }
@@ -142,14 +157,16 @@ pub(crate) mod tests {
         let mut random = fastrand::Rng::with_seed(5);
         // Some lie outside of the image, as undistorted pixels may.
         let mut coordinate = |size: f64| random.f64() * (size + 40.0) - 20.0;
-        let list: Vec<Feature> = (0..800).map(|_| feature(coordinate(640.0), coordinate(480.0), Descriptor::default())).collect();
+        let anywhere = |octave| Feature { octave, ..feature(coordinate(640.0), coordinate(480.0), Descriptor::default()) };
+        let list: Vec<Feature> = (0..4).cycle().take(800).map(anywhere).collect();
         let grid = FrameFeatures::new(list.clone(), &PINHOLE);
         for _ in 0..200 {
             let (centre, radius) = (Vector2::new(coordinate(640.0), coordinate(480.0)), coordinate(60.0).abs());
             let mut found = Vec::new();
-            grid.within(&centre, radius, |i| found.push(i));
+            grid.within(&centre, radius, &(1..=2), |i| found.push(i));
             found.sort_unstable();
-            let expected: Vec<usize> = (0..800).filter(|i| (list[*i].pixel - centre).norm() <= radius).collect();
+            let fits = |f: &Feature| (1..=2).contains(&f.octave) && (f.pixel - centre).norm() <= radius;
+            let expected: Vec<usize> = (0..800).filter(|i| fits(&list[*i])).collect();
             assert_eq!(found, expected);
         }
     }

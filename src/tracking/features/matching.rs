@@ -56,10 +56,10 @@ pub fn match_by_projection(frame: &FrameFeatures, taken: &[bool], queries: &[Que
     let mut claims: Vec<Option<Match>> = vec![None; frame.len()];
     for (index, query) in queries.iter().enumerate() {
         let (mut best, mut second) = (None::<(u32, usize, u8)>, None::<(u32, u8)>);
-        frame.within(&query.pixel, query.radius, |i| {
+        frame.within(&query.pixel, query.radius, &query.octaves, |i| {
             let feature = &frame.features[i];
             let off_depth = feature.depth_metres.is_some_and(|d| (1.0 / d - query.inverse_depth).abs() > INVERSE_DEPTH_GATE);
-            if taken.get(i).copied().unwrap_or(false) || !query.octaves.contains(&feature.octave) || off_depth {
+            if taken.get(i).copied().unwrap_or(false) || off_depth {
                 return;
             }
             let distance = feature.descriptor.distance(&query.descriptor);

@@ -2,9 +2,11 @@
 
 pub mod dense_frame;
 pub mod descriptor;
+pub mod fast;
 pub mod frame_features;
 pub mod matching;
 pub mod orb;
+pub mod orientation;
 pub mod projection;
 pub mod quadtree;
 pub mod stereo;

@@ -1,31 +1,27 @@
 //! ORB features spread evenly over the image (Rublee et al., *ORB*, ICCV 2011; the even spread after Mur-Artal & Tardós,
 //! *ORB-SLAM2*, 2017).
 //!
-//! OpenCV finds FAST corners on each pyramid level and computes the descriptors; choosing the corners (a quadtree, with a lower
-//! threshold where there is no texture) and their orientation (intensity centroid) is done here, so that descriptors are computed
-//! only for those that stay. Levels are worked on in parallel, each by itself: the result does not depend on threads.
+//! FAST corners are found on each pyramid level, with a lower threshold where there is no texture; a quadtree chooses among them. OpenCV computes
+//! the descriptors of those that stay. Levels are worked on in parallel, each by itself: the result does not depend on threads.
 
 use std::sync::Once;
 
 use nalgebra::Vector2;
-use opencv::core::{KeyPoint, KeyPointTraitConst, Mat, MatTraitConst, MatTraitConstManual, Rect, Size, Vector};
+use opencv::core::{KeyPoint, Mat, MatTraitConst, MatTraitConstManual, Size, Vector};
 use opencv::features2d::{self, Feature2DTrait};
 use opencv::imgproc;
 use rayon::prelude::*;
 
 use crate::tracking::features::descriptor::Descriptor;
+use crate::tracking::features::fast::{self, Window, find_corners};
+use crate::tracking::features::orientation::{OrientationPatch, PATCH_RADIUS};
 use crate::tracking::features::quadtree::{Corner, distribute};
 use crate::tracking::{TrackingConfig, TrackingError};
 
 /// Pixels at a level's border without features: the descriptor's patch (31 pixels) must fit.
-const BORDER: i32 = 16;
-/// Radius of the orientation patch, pixels.
-const PATCH_RADIUS: i32 = 15;
-const PATCH_COLUMNS: usize = 2 * PATCH_RADIUS as usize + 2;
+const BORDER: i32 = PATCH_RADIUS + 1;
 /// Side of the squares that are searched again with the lower threshold if they have no corner, pixels.
-const TEXTURE_CELL: i32 = 32;
-/// FAST looks this far around a pixel.
-const FAST_RADIUS: i32 = 3;
+const TEXTURE_CELL: usize = 32;
 
 /// A keypoint in the recorded (distorted) image at full size.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -53,8 +49,13 @@ pub struct LevelImage<'a> {
 
 impl Pyramid {
     pub fn level(&self, octave: u8) -> Result<LevelImage<'_>, TrackingError> {
-        let image = &self.levels[usize::from(octave)];
-        Ok(LevelImage { pixels: image.data_bytes()?, width: image.cols() as usize, height: image.rows() as usize })
+        LevelImage::new(&self.levels[usize::from(octave)])
+    }
+}
+
+impl<'a> LevelImage<'a> {
+    fn new(image: &'a Mat) -> Result<Self, TrackingError> {
+        Ok(Self { pixels: image.data_bytes()?, width: image.cols() as usize, height: image.rows() as usize })
     }
 }
 
@@ -62,19 +63,9 @@ impl Pyramid {
 #[derive(Clone, Debug)]
 pub struct Extractor {
     levels: Vec<Level>,
-    threshold: i32,
-    threshold_low: i32,
-    /// Rows `0..=PATCH_RADIUS` of the round orientation patch.
-    patch_rows: Vec<PatchRow>,
-}
-
-/// A row of the orientation patch, as wide as the widest and a column more, which makes whole vectors.
-#[derive(Clone, Debug)]
-struct PatchRow {
-    /// 1 inside the round patch, 0 outside.
-    inside: [i16; PATCH_COLUMNS],
-    /// The distance from the corner's column inside, 0 outside.
-    column: [i16; PATCH_COLUMNS],
+    threshold: u8,
+    threshold_low: u8,
+    patch: OrientationPatch,
 }
 
 #[derive(Clone, Debug)]
@@ -100,19 +91,11 @@ impl Extractor {
             // A level must hold the border twice and something between.
             .take_while(|level| level.size.width > 2 * BORDER + 8 && level.size.height > 2 * BORDER + 8)
             .collect();
-        let radius = f64::from(PATCH_RADIUS) + 0.5;
-        let patch_row = |v: i32| {
-            let half = (radius * radius - f64::from(v * v)).sqrt() as i16;
-            let column: [i16; PATCH_COLUMNS] = std::array::from_fn(|k| k as i16 - PATCH_RADIUS as i16);
-            let inside = column.map(|c| i16::from(c.abs() <= half));
-            PatchRow { inside, column: std::array::from_fn(|k| inside[k] * column[k]) }
-        };
-        let patch_rows = (0..=PATCH_RADIUS).map(patch_row).collect();
         Self {
             levels,
-            threshold: config.fast_threshold.into(),
-            threshold_low: config.fast_threshold_low_texture.into(),
-            patch_rows,
+            threshold: config.fast_threshold,
+            threshold_low: config.fast_threshold_low_texture,
+            patch: OrientationPatch::new(),
         }
     }
 
@@ -141,98 +124,66 @@ impl Extractor {
     }
 
     fn extract_level(&self, image: &Mat, octave: usize) -> Result<Vec<Keypoint>, TrackingError> {
-        let corners = distribute(self.detect(image)?, image.cols(), image.rows(), self.levels[octave].budget);
+        let pixels = LevelImage::new(image)?;
+        let corners = distribute(self.detect(&pixels), image.cols(), image.rows(), self.levels[octave].budget);
         if corners.is_empty() {
             return Ok(Vec::new());
         }
-        let pixels = image.data_bytes()?;
-        let angles: Vec<f32> = corners.iter().map(|c| self.orientation(pixels, image.cols(), c)).collect();
+        let angles = self.patch.angles(&pixels, &corners);
         let mut keypoints: Vector<KeyPoint> = Vector::with_capacity(corners.len());
-        for (index, (corner, angle_rad)) in corners.iter().zip(&angles).enumerate() {
+        for (corner, angle_rad) in corners.iter().zip(&angles) {
             let (x, y) = (corner.x as f32, corner.y as f32);
-            keypoints.push(KeyPoint::new_coords(x, y, 31.0, angle_rad.to_degrees(), corner.score, 0, index as i32)?);
+            keypoints.push(KeyPoint::new_coords(x, y, 31.0, angle_rad.to_degrees(), corner.score, 0, -1)?);
         }
         let mut orb = features2d::ORB::create(1, 1.2, 1, BORDER, 0, 2, features2d::ORB_ScoreType::FAST_SCORE, 31, 20)?;
         let mut descriptors = Mat::default();
+        // A row for each: no corner lies on the border that it leaves out.
         orb.compute(image, &mut keypoints, &mut descriptors)?;
         // Pixel centres stay where they belong when an image is resized: (x + ½)·s − ½.
         let full = self.levels[0].size;
         let sx = f64::from(full.width) / f64::from(image.cols());
         let sy = f64::from(full.height) / f64::from(image.rows());
-        let mut found = Vec::with_capacity(keypoints.len());
-        for row in 0..keypoints.len() {
-            let index = keypoints.get(row)?.class_id() as usize;
-            let corner = &corners[index];
-            found.push(Keypoint {
+        let keypoint = |(row, (corner, angle_rad)): (usize, (&Corner, &f32))| {
+            Ok(Keypoint {
                 pixel: Vector2::new((f64::from(corner.x) + 0.5) * sx - 0.5, (f64::from(corner.y) + 0.5) * sy - 0.5),
                 octave: octave as u8,
-                angle_rad: angles[index],
+                angle_rad: *angle_rad,
                 descriptor: Descriptor::from_bytes(descriptors.at_row::<u8>(row as i32)?),
-            });
-        }
-        Ok(found)
+            })
+        };
+        corners.iter().zip(&angles).enumerate().map(keypoint).collect()
     }
 
     /// All FAST corners inside the border; squares without any are searched again with the lower threshold.
-    fn detect(&self, image: &Mat) -> Result<Vec<Corner>, TrackingError> {
-        let (width, height) = (image.cols(), image.rows());
-        let inside = |x: i32, y: i32| x >= BORDER && y >= BORDER && x < width - BORDER && y < height - BORDER;
+    fn detect(&self, image: &LevelImage<'_>) -> Vec<Corner> {
+        let border = BORDER as usize;
+        let (right, bottom) = (image.width - border, image.height - border);
         let mut corners = Vec::new();
-        fast_corners(image, self.threshold, (0, 0), &inside, &mut corners)?;
-        let cells_x = (width - 2 * BORDER + TEXTURE_CELL - 1) / TEXTURE_CELL;
-        let cells_y = (height - 2 * BORDER + TEXTURE_CELL - 1) / TEXTURE_CELL;
-        let mut textured = vec![false; (cells_x * cells_y) as usize];
+        // Corners on the border can be stronger than their neighbours inside.
+        find_corners(
+            image,
+            &Window { columns: border - 1..right + 1, rows: border - 1..bottom + 1 },
+            self.threshold,
+            &mut corners,
+        );
+        let inside = |c: &Corner| (BORDER..right as i32).contains(&c.x) && (BORDER..bottom as i32).contains(&c.y);
+        corners.retain(inside);
+        let columns = (right - border).div_ceil(TEXTURE_CELL);
+        let mut textured = vec![false; columns * (bottom - border).div_ceil(TEXTURE_CELL)];
         for c in &corners {
-            textured[((c.y - BORDER) / TEXTURE_CELL * cells_x + (c.x - BORDER) / TEXTURE_CELL) as usize] = true;
+            textured[(c.y as usize - border) / TEXTURE_CELL * columns + (c.x as usize - border) / TEXTURE_CELL] = true;
         }
         for (cell, _) in textured.iter().enumerate().filter(|(_, has_corner)| !**has_corner) {
-            let (x0, y0) = (
-                BORDER + cell as i32 % cells_x * TEXTURE_CELL - FAST_RADIUS,
-                BORDER + cell as i32 / cells_x * TEXTURE_CELL - FAST_RADIUS,
-            );
-            let x1 = (x0 + TEXTURE_CELL + 2 * FAST_RADIUS).min(width);
-            let y1 = (y0 + TEXTURE_CELL + 2 * FAST_RADIUS).min(height);
-            let square = image.roi(Rect::new(x0, y0, x1 - x0, y1 - y0))?;
-            fast_corners(&square, self.threshold_low, (x0, y0), &inside, &mut corners)?;
+            let (x, y) = (border + cell % columns * TEXTURE_CELL, border + cell / columns * TEXTURE_CELL);
+            let window = Window {
+                columns: x..(x + TEXTURE_CELL).min(image.width - fast::RADIUS),
+                rows: y..(y + TEXTURE_CELL).min(image.height - fast::RADIUS),
+            };
+            find_corners(image, &window, self.threshold_low, &mut corners);
         }
-        Ok(corners)
+        corners.retain(inside);
+        corners
     }
-
-    /// Direction from a corner to the intensity centroid of the round patch about it, radians in `[0, 2π)`.
-    fn orientation(&self, pixels: &[u8], width: i32, corner: &Corner) -> f32 {
-        let (mut m10, mut m01) = (0i64, 0i64);
-        for v in -PATCH_RADIUS..=PATCH_RADIUS {
-            let row = &self.patch_rows[v.unsigned_abs() as usize];
-            let start = ((corner.y + v) * width + corner.x - PATCH_RADIUS) as usize;
-            let (mut row_sum, mut row_moment) = (0i32, 0i32);
-            for ((value, inside), column) in pixels[start..start + PATCH_COLUMNS].iter().zip(&row.inside).zip(&row.column) {
-                row_sum += i32::from(*value) * i32::from(*inside);
-                row_moment += i32::from(*value) * i32::from(*column);
-            }
-            m10 += i64::from(row_moment);
-            m01 += i64::from(v * row_sum);
-        }
-        (m01 as f32).atan2(m10 as f32).rem_euclid(std::f32::consts::TAU)
-    }
-}
-
-fn fast_corners(
-    image: &impl opencv::core::ToInputArray,
-    threshold: i32,
-    (x0, y0): (i32, i32),
-    inside: &impl Fn(i32, i32) -> bool,
-    corners: &mut Vec<Corner>,
-) -> Result<(), TrackingError> {
-    let mut found: Vector<KeyPoint> = Vector::new();
-    features2d::fast(image, &mut found, threshold, true)?;
-    for keypoint in &found {
-        let at = keypoint.pt();
-        let (x, y) = (at.x as i32 + x0, at.y as i32 + y0);
-        if inside(x, y) {
-            corners.push(Corner { x, y, score: keypoint.response() });
-        }
-    }
-    Ok(())
 }
 
 #[cfg(test)]

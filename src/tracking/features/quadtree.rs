@@ -3,6 +3,7 @@
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
+use std::ops::Range;
 
 /// A corner at a pyramid level, whole pixels of that level.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -12,80 +13,100 @@ pub struct Corner {
     pub score: f32,
 }
 
+/// A part of the image with the place of its corners in the list.
 struct Part {
     x0: f64,
     y0: f64,
     width: f64,
     height: f64,
-    corners: Vec<Corner>,
+    corners: Range<usize>,
+}
+
+/// Moves the corners of a range so that each quarter's lie together, in their order, and returns where.
+fn group(
+    corners: &mut [Corner],
+    range: &Range<usize>,
+    scratch: &mut Vec<Corner>,
+    quarter: impl Fn(&Corner) -> usize,
+) -> [Range<usize>; 4] {
+    scratch.clear();
+    scratch.extend_from_slice(&corners[range.clone()]);
+    let mut counts = [0; 4];
+    scratch.iter().for_each(|c| counts[quarter(c)] += 1);
+    let mut end = range.start;
+    let groups = counts.map(|count| {
+        end += count;
+        end - count..end
+    });
+    let mut places = groups.each_ref().map(|g| g.start);
+    for corner in scratch {
+        let place = &mut places[quarter(corner)];
+        corners[*place] = *corner;
+        *place += 1;
+    }
+    groups
 }
 
 impl Part {
-    fn quarters(self) -> impl Iterator<Item = Self> {
+    /// Those of its quarters that have corners.
+    fn quarters(&self, corners: &mut [Corner], scratch: &mut Vec<Corner>) -> impl Iterator<Item = Self> + use<> {
         let (w, h) = (self.width / 2.0, self.height / 2.0);
-        let (cx, cy) = (self.x0 + w, self.y0 + h);
-        let mut lists: [Vec<Corner>; 4] = Default::default();
-        for corner in self.corners {
-            lists[usize::from(f64::from(corner.x) >= cx) + 2 * usize::from(f64::from(corner.y) >= cy)].push(corner);
-        }
-        lists.into_iter().enumerate().filter(|(_, list)| !list.is_empty()).map(move |(k, corners)| Self {
-            x0: self.x0 + w * (k % 2) as f64,
-            y0: self.y0 + h * (k / 2) as f64,
+        let (x0, y0) = (self.x0, self.y0);
+        let (cx, cy) = (x0 + w, y0 + h);
+        let quarter = |c: &Corner| usize::from(f64::from(c.x) >= cx) + 2 * usize::from(f64::from(c.y) >= cy);
+        let groups = group(corners, &self.corners, scratch, quarter).into_iter().enumerate();
+        groups.filter(|(_, corners)| !corners.is_empty()).map(move |(k, corners)| Self {
+            x0: x0 + w * (k % 2) as f64,
+            y0: y0 + h * (k / 2) as f64,
             width: w,
             height: h,
             corners,
         })
     }
-
-    fn strongest(&self) -> Option<Corner> {
-        // On equal scores the last wins, as does the order of detection: deterministic.
-        self.corners.iter().copied().max_by(|a, b| a.score.total_cmp(&b.score))
-    }
 }
 
 /// At most about `budget` of `corners` (up to three more), evenly spread over `width` × `height`.
-pub fn distribute(corners: Vec<Corner>, width: i32, height: i32, budget: usize) -> Vec<Corner> {
+pub fn distribute(mut corners: Vec<Corner>, width: i32, height: i32, budget: usize) -> Vec<Corner> {
     if budget == 0 || corners.is_empty() {
         return Vec::new();
     }
     // Square parts spread most evenly.
     let columns = (f64::from(width) / f64::from(height)).round().max(1.0);
     let part_width = f64::from(width) / columns;
-    let mut parts: Vec<Option<Part>> = (0..columns as usize)
-        .map(|k| {
-            let x0 = part_width * k as f64;
-            let own = |c: &&Corner| ((f64::from(c.x) / part_width) as usize).min(columns as usize - 1) == k;
-            let corners = corners.iter().filter(own).copied().collect();
-            Some(Part { x0, y0: 0.0, width: part_width, height: f64::from(height), corners })
-        })
-        .collect();
+    let column = |c: &Corner| ((f64::from(c.x) / part_width) as usize).min(columns as usize - 1);
+    corners.sort_by_key(column);
+    let mut parts: Vec<Part> = Vec::new();
+    for own in corners.chunk_by(|a, b| column(a) == column(b)) {
+        let start = parts.last().map_or(0, |part| part.corners.end);
+        let x0 = part_width * column(&own[0]) as f64;
+        parts.push(Part { x0, y0: 0.0, width: part_width, height: f64::from(height), corners: start..start + own.len() });
+    }
     // Largest parts first, then the fullest, then the oldest.
     let mut heap: BinaryHeap<(Reverse<usize>, usize, Reverse<usize>)> = BinaryHeap::new();
-    let mut leaves = 0;
-    for (index, part) in parts.iter().enumerate() {
-        let count = part.as_ref().map_or(0, |p| p.corners.len());
-        leaves += usize::from(count > 0);
-        if count > 1 {
-            heap.push((Reverse(0), count, Reverse(index)));
+    let push = |heap: &mut BinaryHeap<_>, depth: usize, index: usize, part: &Part| {
+        if part.corners.len() > 1 {
+            heap.push((Reverse(depth), part.corners.len(), Reverse(index)));
         }
-    }
+    };
+    parts.iter().enumerate().for_each(|(index, part)| push(&mut heap, 0, index, part));
+    let (mut leaves, mut scratch) = (parts.len(), Vec::new());
     while leaves < budget {
         let Some((Reverse(depth), _, Reverse(index))) = heap.pop() else { break };
-        let Some(part) = parts[index].take() else { continue };
-        if part.width < 1.0 {
-            parts[index] = Some(part);
+        if parts[index].width < 1.0 {
             continue;
         }
         leaves -= 1;
-        for quarter in part.quarters() {
+        for quarter in parts[index].quarters(&mut corners, &mut scratch) {
             leaves += 1;
-            if quarter.corners.len() > 1 {
-                heap.push((Reverse(depth + 1), quarter.corners.len(), Reverse(parts.len())));
-            }
-            parts.push(Some(quarter));
+            push(&mut heap, depth + 1, parts.len(), &quarter);
+            parts.push(quarter);
         }
+        // Its quarters have its corners.
+        parts[index].corners = 0..0;
     }
-    parts.iter().flatten().filter_map(Part::strongest).collect()
+    // On equal scores the last wins, as does the order of detection: deterministic.
+    let strongest = |part: &Part| corners[part.corners.clone()].iter().copied().max_by(|a, b| a.score.total_cmp(&b.score));
+    parts.iter().filter_map(strongest).collect()
 }
 
 #[cfg(test)]

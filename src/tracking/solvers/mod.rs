@@ -4,6 +4,7 @@ pub mod bundle;
 pub mod depth_bias;
 pub mod epipolar;
 pub mod intrinsics;
+pub mod normal_equations;
 pub mod pixel_noise;
 pub mod pose;
 pub mod pose_graph;

@@ -3,9 +3,10 @@
 //! Several rounds; after each, every measurement is classified anew by χ² and may come back. Early rounds use Huber's kernel
 //! (Mur-Artal & Tardós, *ORB-SLAM2*, 2017, sec. III-C). A measurement whose depth alone disagrees keeps its pixel.
 
-use nalgebra::{Matrix6, Point3, Vector3, Vector6};
+use nalgebra::{Matrix6, Point3, Vector6};
 
 use crate::geometry::{Pinhole, Se3, se3};
+use crate::tracking::solvers::normal_equations::{GroupedObservations, NormalEquations};
 use crate::tracking::solvers::residual::{InlierClass, Measurement};
 
 const ROUNDS: usize = 4;
@@ -73,8 +74,8 @@ pub fn optimise_pose(
             };
         }
         let converged = if round + 1 == ROUNDS { CONVERGED } else { NEARLY_CONVERGED };
-        let round = Round { robust: round < ROBUST_ROUNDS, converged, prior };
-        pose = refine(pinhole, &pose, observations, &classes, &round);
+        let trusted = GroupedObservations::new(observations, &classes, round < ROBUST_ROUNDS);
+        pose = refine(pinhole, &pose, prior, &trusted, converged);
         for (t, o) in classes.iter_mut().zip(observations) {
             *t = o.measurement.classify(pinhole, &(pose * o.point_in_world).coords);
         }
@@ -91,77 +92,52 @@ pub fn median_squared(pinhole: &Pinhole, pose: &Se3, observations: &[PoseObserva
     if squared.is_empty() { 0.0 } else { *squared.select_nth_unstable_by(middle, f64::total_cmp).1 }
 }
 
-/// How one round is solved.
-struct Round<'a> {
-    /// With Huber's kernel.
-    robust: bool,
-    /// The step below which it ends.
+/// Levenberg-Marquardt until a step is below `converged`.
+fn refine(
+    pinhole: &Pinhole,
+    initial: &Se3,
+    prior: Option<&PosePrior>,
+    observations: &GroupedObservations,
     converged: f64,
-    prior: Option<&'a PosePrior>,
-}
-
-/// Levenberg-Marquardt over the trusted observations.
-fn refine(pinhole: &Pinhole, initial: &Se3, observations: &[PoseObservation], classes: &[InlierClass], round: &Round<'_>) -> Se3 {
+) -> Se3 {
+    let linearise = |pose: &Se3| {
+        let mut equations = observations.linearise(pinhole, pose);
+        if let Some(prior) = prior {
+            let (pull, share) = prior.pull(pose);
+            equations.hessian += prior.information;
+            equations.gradient += pull;
+            equations.cost += share;
+        }
+        equations
+    };
+    let cost = |pose: &Se3| observations.cost(pinhole, pose) + prior.map_or(0.0, |prior| prior.pull(pose).1);
     let mut pose = *initial;
     let mut lambda = 1e-4;
-    let (mut hessian, mut gradient, mut cost) = linearise(pinhole, &pose, observations, classes, round);
+    let mut equations = linearise(&pose);
     for _ in 0..STEPS_PER_ROUND {
-        let mut damped = hessian;
+        let NormalEquations { hessian, gradient, .. } = &equations;
+        let mut damped = *hessian;
         for k in 0..6 {
             damped[(k, k)] += lambda * hessian[(k, k)] + 1e-9;
         }
         let Some(step) = damped.cholesky().map(|c| c.solve(&-gradient)) else { break };
         let candidate = se3::exp(&step) * pose;
-        let (h, g, candidate_cost) = linearise(pinhole, &candidate, observations, classes, round);
-        if candidate_cost < cost {
-            (pose, hessian, gradient, cost) = (candidate, h, g, candidate_cost);
+        if step.norm() < converged {
+            if cost(&candidate) < equations.cost {
+                pose = candidate;
+            }
+            break;
+        }
+        let there = linearise(&candidate);
+        if there.cost < equations.cost {
+            (pose, equations) = (candidate, there);
             lambda *= 0.1;
         } else {
             lambda *= 10.0;
         }
-        if step.norm() < round.converged {
-            break;
-        }
     }
     pose.rotation.renormalize();
     pose
-}
-
-/// Normal equations and cost. A point behind the camera costs as much as a far outlier, so that no step gains by losing it.
-fn linearise(
-    pinhole: &Pinhole,
-    pose: &Se3,
-    observations: &[PoseObservation],
-    classes: &[InlierClass],
-    round: &Round<'_>,
-) -> (Matrix6<f64>, Vector6<f64>, f64) {
-    const BEHIND_COST: f64 = 1e4;
-    let (mut hessian, mut gradient, mut cost) = (Matrix6::zeros(), Vector6::zeros(), 0.0);
-    for (o, t) in observations.iter().zip(classes) {
-        let Some(measurement) = o.measurement.restricted_to(*t) else { continue };
-        let p_in_camera = (pose * o.point_in_world).coords;
-        let Some(residual) = measurement.residual(pinhole, &p_in_camera) else {
-            cost += BEHIND_COST;
-            continue;
-        };
-        let (rho, weights) =
-            if round.robust { Measurement::robust(&residual) } else { (residual.norm_squared(), Vector3::repeat(1.0)) };
-        let j = measurement.jacobian_by_pose(pinhole, &p_in_camera);
-        for row in 0..6 {
-            let weighted = j.column(row).component_mul(&weights);
-            gradient[row] += weighted.dot(&residual);
-            for column in 0..=row {
-                hessian[(row, column)] += weighted.dot(&j.column(column));
-            }
-        }
-        cost += rho;
-    }
-    hessian.fill_upper_triangle_with_lower_triangle();
-    if let Some(prior) = round.prior {
-        let (pull, share) = prior.pull(pose);
-        (hessian, gradient, cost) = (hessian + prior.information, gradient + pull, cost + share);
-    }
-    (hessian, gradient, cost)
 }
 
 #[cfg(test)]

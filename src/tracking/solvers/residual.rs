@@ -11,17 +11,17 @@ use crate::geometry::se3::skew;
 use crate::tracking::solvers::depth_bias::DepthBias;
 
 /// 95% of true pixels lie below this (χ², 2 degrees of freedom).
-const CHI2_PIXEL: f64 = 5.991;
+pub const CHI2_PIXEL: f64 = 5.991;
 /// Squared depth residuals beyond this are wrong: wide, for the tails of a depth sensor are heavy.
 const CHI2_DEPTH: f64 = 9.0;
 /// Squared depth residuals beyond this pull less and less.
 ///
 /// A single depth varies by a fraction of the standard deviation, which covers errors that a landmark's views share. What varies more is often a surface
 /// behind an edge.
-const HUBER_DEPTH: f64 = 0.04;
+pub const HUBER_DEPTH: f64 = 0.04;
 
 /// Points nearer than this to the camera's plane, or behind it, are not seen, metres.
-const NEAR_METRES: f64 = 1e-2;
+pub const NEAR_METRES: f64 = 1e-2;
 
 /// One measured point.
 #[derive(Clone, Copy, Debug, PartialEq)]
