@@ -6,7 +6,7 @@ use std::time::Instant;
 
 use image::RgbImage;
 use nalgebra::Vector2;
-use pulp::{Arch, Simd, WithSimd};
+use pulp::{Arch, Simd};
 
 use crate::geometry::Camera;
 use crate::sequence::{DepthImage, Frame, Sensor};
@@ -140,24 +140,16 @@ impl FrontEnd {
 type MeasuredDepth = Option<(f64, f64)>;
 
 /// Rec. 601 luma in integers, row-major.
-fn luma(image: &RgbImage) -> Vec<u8> {
-    Arch::new().dispatch(Luma(image.as_raw().as_chunks().0))
-}
-
-struct Luma<'a>(&'a [[u8; 3]]);
-
-impl WithSimd for Luma<'_> {
-    type Output = Vec<u8>;
-
-    #[inline(always)]
-    fn with_simd<S: Simd>(self, _: S) -> Vec<u8> {
-        let mut grey = vec![0; self.0.len()];
-        for (grey, [r, g, b]) in grey.iter_mut().zip(self.0) {
-            // The weights' sum is 256: 16 bits hold the largest value.
-            *grey = ((u16::from(*r) * 77 + u16::from(*g) * 150 + u16::from(*b) * 29 + 128) >> 8) as u8;
-        }
-        grey
+#[pulp::with_simd(luma = Arch::new())]
+#[inline(always)]
+fn luma_with<S: Simd>(_: S, image: &RgbImage) -> Vec<u8> {
+    let (pixels, _) = image.as_raw().as_chunks();
+    let mut grey = vec![0; pixels.len()];
+    for (grey, [r, g, b]) in grey.iter_mut().zip(pixels) {
+        // The weights' sum is 256: 16 bits hold the largest value.
+        *grey = ((u16::from(*r) * 77 + u16::from(*g) * 150 + u16::from(*b) * 29 + 128) >> 8) as u8;
     }
+    grey
 }
 
 /// The depth at a recorded pixel, unless it is out of range, not finite, or on an edge.

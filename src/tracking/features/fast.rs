@@ -6,7 +6,7 @@
 
 use std::ops::Range;
 
-use pulp::{Arch, Simd, WithSimd};
+use pulp::{Arch, Simd};
 
 use crate::tracking::features::orb::LevelImage;
 use crate::tracking::features::quadtree::Corner;
@@ -43,44 +43,43 @@ pub struct Window {
 
 /// Adds the corners in a window of an image, row by row: the pixels whose score is above that of their eight neighbours in the window. The image is
 /// at least 38 pixels wide.
-pub fn find_corners(image: &LevelImage<'_>, window: &Window, threshold: u8, found: &mut Vec<Corner>) {
-    Arch::new().dispatch(Search { image, window, threshold, found });
-}
-
-struct Search<'a> {
+#[pulp::with_simd(find_corners = Arch::new())]
+#[inline(always)]
+pub fn find_corners_with<'a, S: Simd>(
+    _: S,
     image: &'a LevelImage<'a>,
     window: &'a Window,
     threshold: u8,
     found: &'a mut Vec<Corner>,
-}
-
-impl WithSimd for Search<'_> {
-    type Output = ();
-
-    #[inline(always)]
-    fn with_simd<S: Simd>(self, _: S) {
-        let Window { columns, rows } = self.window;
-        // A column and a row of zeros on each side: every pixel has eight neighbours.
-        let row_bytes = (columns.len() + 2).next_multiple_of(8);
-        let mut three = [vec![0; row_bytes], vec![0; row_bytes], vec![0; row_bytes]];
-        for y in rows.start..=rows.end {
-            three.rotate_left(1);
-            three[2].fill(0);
-            if y < rows.end {
-                self.score_row(y, &mut three[2][1..]);
-            }
-            if y > rows.start {
-                add_maxima(&three, columns.start, y - 1, self.found);
-            }
+) {
+    let Window { columns, rows } = window;
+    let search = Search { image, columns, threshold };
+    // A column and a row of zeros on each side: every pixel has eight neighbours.
+    let row_bytes = (columns.len() + 2).next_multiple_of(8);
+    let mut three = [vec![0; row_bytes], vec![0; row_bytes], vec![0; row_bytes]];
+    for y in rows.start..=rows.end {
+        three.rotate_left(1);
+        three[2].fill(0);
+        if y < rows.end {
+            search.score_row(y, &mut three[2][1..]);
+        }
+        if y > rows.start {
+            add_maxima(&three, columns.start, y - 1, found);
         }
     }
+}
+
+struct Search<'a> {
+    image: &'a LevelImage<'a>,
+    columns: &'a Range<usize>,
+    threshold: u8,
 }
 
 impl Search<'_> {
     /// Scores of a row of the window; 0 is no corner.
     #[inline(always)]
     fn score_row(&self, y: usize, row: &mut [u8]) {
-        let Window { columns, .. } = self.window;
+        let columns = self.columns;
         for x in columns.clone().step_by(LANES) {
             // All lanes lie in the image.
             let start = x.min(self.image.width - RADIUS - LANES);

@@ -1,6 +1,6 @@
 //! The orientation of corners (Rublee et al., *ORB*, ICCV 2011, sec. 3.2): the direction to the intensity centroid of a round patch.
 
-use pulp::{Arch, Simd, WithSimd};
+use pulp::{Arch, Simd};
 
 use crate::tracking::features::orb::LevelImage;
 use crate::tracking::features::quadtree::Corner;
@@ -29,38 +29,20 @@ impl OrientationPatch {
 
     /// Directions from corners to the centroids of their patches, radians in `[0, 2π)`. The patches and a column more lie in the image.
     pub fn angles(&self, image: &LevelImage<'_>, corners: &[Corner]) -> Vec<f32> {
-        Arch::new().dispatch(Angles { patch: self, image, corners })
+        angles(self, image, corners)
     }
-}
 
-struct Angles<'a> {
-    patch: &'a OrientationPatch,
-    image: &'a LevelImage<'a>,
-    corners: &'a [Corner],
-}
-
-impl WithSimd for Angles<'_> {
-    type Output = Vec<f32>;
-
+    /// First moments of a patch by column and by row. Sums of a column have 16 bits: 31 · 255 and (1 + … + 15) · 255 fit.
     #[inline(always)]
-    fn with_simd<S: Simd>(self, _: S) -> Vec<f32> {
-        let mut angles = Vec::with_capacity(self.corners.len());
-        for corner in self.corners {
-            let (m10, m01) = self.moments(corner);
-            angles.push((m01 as f32).atan2(m10 as f32).rem_euclid(std::f32::consts::TAU));
-        }
-        angles
-    }
-}
-
-impl Angles<'_> {
-    /// First moments of the patch by column and by row. Sums of a column have 16 bits: 31 · 255 and (1 + … + 15) · 255 fit.
-    #[inline(always)]
-    fn moments(&self, corner: &Corner) -> (i32, i32) {
+    fn moments(&self, image: &LevelImage<'_>, corner: &Corner) -> (i32, i32) {
+        let row = |v: i32| -> &[u8; COLUMNS] {
+            let first = (corner.y + v) as usize * image.width + (corner.x - PATCH_RADIUS) as usize;
+            image.pixels[first..].first_chunk().expect("a patch inside the image")
+        };
         let (mut sums, mut moments) = ([0i16; COLUMNS], [0i16; COLUMNS]);
-        for (v, mask) in (0..).zip(&self.patch.masks) {
+        for (v, mask) in (0..).zip(&self.masks) {
             // The middle row counts once.
-            let (above, below) = (self.row(corner, -v), self.row(corner, v));
+            let (above, below) = (row(-v), row(v));
             let once = if v == 0 { 0 } else { -1 };
             for k in 0..COLUMNS {
                 let (above, below) = (i16::from(above[k]) & mask[k] & once, i16::from(below[k]) & mask[k]);
@@ -75,12 +57,17 @@ impl Angles<'_> {
         }
         (m10, m01)
     }
+}
 
-    #[inline(always)]
-    fn row(&self, corner: &Corner, v: i32) -> &[u8; COLUMNS] {
-        let first = (corner.y + v) as usize * self.image.width + (corner.x - PATCH_RADIUS) as usize;
-        self.image.pixels[first..].first_chunk().expect("a patch inside the image")
+#[pulp::with_simd(angles = Arch::new())]
+#[inline(always)]
+fn angles_with<'a, S: Simd>(_: S, patch: &'a OrientationPatch, image: &'a LevelImage<'a>, corners: &'a [Corner]) -> Vec<f32> {
+    let mut angles = Vec::with_capacity(corners.len());
+    for corner in corners {
+        let (m10, m01) = patch.moments(image, corner);
+        angles.push((m01 as f32).atan2(m10 as f32).rem_euclid(std::f32::consts::TAU));
     }
+    angles
 }
 
 #[cfg(test)]

@@ -7,7 +7,7 @@
 
 use crate::tracking::features::descriptor::Descriptor;
 use crate::tracking::features::frame_features::Feature;
-use crate::tracking::map::tally::{distinct, tally};
+use crate::tracking::map::tally::tally_votes;
 use crate::tracking::map::trim;
 
 /// Descriptors in a leaf before it is split.
@@ -102,14 +102,15 @@ impl KeyframeDatabase {
     /// The keyframes that show some of these features, most alike first, then newest first.
     pub fn query(&self, features: &[Feature]) -> Vec<Similarity> {
         // Each feature has one vote for a keyframe.
-        let votes = features.iter().flat_map(|feature| {
-            let Node::Leaf(entries) = &self.nodes[self.leaf(&feature.descriptor)] else { return Vec::new() };
+        let votes = features.iter().zip(0..).flat_map(|(feature, voter)| {
+            let entries =
+                if let Node::Leaf(entries) = &self.nodes[self.leaf(&feature.descriptor)] { entries.as_slice() } else { &[] };
             let alike = entries.iter().filter(|entry| entry.descriptor.distance(&feature.descriptor) <= MAX_DISTANCE);
-            distinct(alike.map(|entry| entry.keyframe as usize))
+            alike.map(move |entry| (entry.keyframe as usize, voter))
         });
         let score = |keyframe: usize, votes: usize| votes as f64 / self.features[keyframe].max(features.len()) as f64;
         let similarity = |(keyframe, votes)| Similarity { keyframe, score: score(keyframe, votes) };
-        let mut ranked: Vec<Similarity> = tally(votes).into_iter().map(similarity).collect();
+        let mut ranked: Vec<Similarity> = tally_votes(votes).into_iter().map(similarity).collect();
         ranked.sort_by(|a, b| b.score.total_cmp(&a.score).then(b.keyframe.cmp(&a.keyframe)));
         ranked
     }

@@ -2,27 +2,43 @@
 
 use std::cell::RefCell;
 
+/// An id's count and who has been counted last.
+#[derive(Clone, Copy, Default)]
+struct Count {
+    count: u32,
+    last_voter: u32,
+}
+
 thread_local! {
     /// By id; all zero between two calls.
-    static COUNTS: RefCell<Vec<u32>> = const { RefCell::new(Vec::new()) };
+    static COUNTS: RefCell<Vec<Count>> = const { RefCell::new(Vec::new()) };
 }
 
 /// The ids and how often each comes, in the order in which they come first.
 pub fn tally(ids: impl Iterator<Item = usize>) -> Vec<(usize, usize)> {
+    tally_votes(ids.zip(0..))
+}
+
+/// The ids and how many voters name them, in the order in which they come first. Votes, of an id and a voter, are sorted by voter.
+pub fn tally_votes(votes: impl Iterator<Item = (usize, u32)>) -> Vec<(usize, usize)> {
     // Taken out, so that the ids may come from another tally.
     let mut counts = COUNTS.take();
     let mut found: Vec<(usize, usize)> = Vec::new();
-    for id in ids {
+    for (id, voter) in votes {
         if id >= counts.len() {
-            counts.resize((id + 1).next_power_of_two(), 0);
+            counts.resize((id + 1).next_power_of_two(), Count::default());
         }
-        if counts[id] == 0 {
+        let Count { count, last_voter } = &mut counts[id];
+        if *count == 0 {
             found.push((id, 0));
+        } else if *last_voter == voter {
+            continue;
         }
-        counts[id] += 1;
+        *count += 1;
+        *last_voter = voter;
     }
     for (id, count) in &mut found {
-        *count = std::mem::take(&mut counts[*id]) as usize;
+        *count = std::mem::take(&mut counts[*id]).count as usize;
     }
     COUNTS.set(counts);
     found
@@ -43,5 +59,11 @@ mod tests {
         let nested = tally([1, 3].into_iter().flat_map(|k| distinct([k, 5, k].into_iter())));
         assert_eq!(nested, [(1, 1), (5, 2), (3, 1)]);
         assert!(distinct(std::iter::empty()).is_empty());
+    }
+
+    #[test]
+    fn a_voter_counts_once_for_an_id() {
+        let votes = [(7, 0), (2, 0), (7, 0), (7, 1), (2, 3), (7, 3), (7, 3)];
+        assert_eq!(tally_votes(votes.into_iter()), [(7, 3), (2, 2)]);
     }
 }

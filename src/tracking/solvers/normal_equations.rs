@@ -4,7 +4,7 @@
 use std::ops::{Add, AddAssign, Mul, Neg, Sub};
 
 use nalgebra::{Matrix6, Vector6};
-use pulp::{Arch, Simd, WithSimd};
+use pulp::{Arch, Simd};
 
 use crate::geometry::{Pinhole, Se3};
 use crate::tracking::solvers::pose::PoseObservation;
@@ -62,12 +62,12 @@ impl GroupedObservations {
 
     /// The cost at a pose.
     pub fn cost(&self, pinhole: &Pinhole, camera_from_world: &Se3) -> f64 {
-        Arch::new().dispatch(Cost(Evaluation::new(self, pinhole, camera_from_world)))
+        cost(&Evaluation::new(self, pinhole, camera_from_world))
     }
 
     /// Normal equations and [`Self::cost`] at a pose.
     pub fn linearise(&self, pinhole: &Pinhole, camera_from_world: &Se3) -> NormalEquations {
-        Arch::new().dispatch(Linearisation(Evaluation::new(self, pinhole, camera_from_world)))
+        linearise(&Evaluation::new(self, pinhole, camera_from_world))
     }
 }
 
@@ -164,51 +164,41 @@ impl<'a> Evaluation<'a> {
     }
 }
 
-struct Cost<'a>(Evaluation<'a>);
-
-impl WithSimd for Cost<'_> {
-    type Output = f64;
-
-    #[inline(always)]
-    fn with_simd<S: Simd>(self, _: S) -> f64 {
-        let mut cost = Lanes::all(0.0);
-        for group in self.0.groups {
-            cost += self.0.terms(group).cost;
-        }
-        cost.sum()
+#[pulp::with_simd(cost = Arch::new())]
+#[inline(always)]
+fn cost_with<'a, S: Simd>(_: S, evaluation: &'a Evaluation<'a>) -> f64 {
+    let mut cost = Lanes::all(0.0);
+    for group in evaluation.groups {
+        cost += evaluation.terms(group).cost;
     }
+    cost.sum()
 }
 
-struct Linearisation<'a>(Evaluation<'a>);
-
-impl WithSimd for Linearisation<'_> {
-    type Output = NormalEquations;
-
-    #[inline(always)]
-    fn with_simd<S: Simd>(self, _: S) -> NormalEquations {
-        let mut sums = Sums { hessian: [Lanes::all(0.0); ENTRIES], gradient: [Lanes::all(0.0); 6] };
-        let mut cost = Lanes::all(0.0);
-        for group in self.0.groups {
-            let t = self.0.terms(group);
-            let [x, y, z] = t.p_in_camera;
-            let [a, c] = [0, 1].map(|k| self.0.focal[k] * t.inverse_z * t.pixel_weight);
-            let (b, d) = (-(a * x * t.inverse_z), -(c * y * t.inverse_z));
-            let e = -(t.inverse_z * t.inverse_z * t.depth_weight);
-            // Rows of the Jacobian; the other entries are zero.
-            sums.add_row([0, 2, 3, 4, 5], [a, b, b * y, a * z - b * x, -(a * y)], t.robust_pixel, t.residual[0]);
-            sums.add_row([1, 2, 3, 4, 5], [c, d, d * y - c * z, -(d * x), c * x], t.robust_pixel, t.residual[1]);
-            sums.add_row([2, 3, 4], [e, e * y, -(e * x)], t.robust_depth, t.residual[2]);
-            cost += t.cost;
-        }
-        let mut hessian = Matrix6::zeros();
-        for row in 0..6 {
-            for column in 0..=row {
-                hessian[(row, column)] = sums.hessian[entry(row, column)].sum();
-            }
-        }
-        hessian.fill_upper_triangle_with_lower_triangle();
-        NormalEquations { hessian, gradient: Vector6::from_fn(|k, _| sums.gradient[k].sum()), cost: cost.sum() }
+#[pulp::with_simd(linearise = Arch::new())]
+#[inline(always)]
+fn linearise_with<'a, S: Simd>(_: S, evaluation: &'a Evaluation<'a>) -> NormalEquations {
+    let mut sums = Sums { hessian: [Lanes::all(0.0); ENTRIES], gradient: [Lanes::all(0.0); 6] };
+    let mut cost = Lanes::all(0.0);
+    for group in evaluation.groups {
+        let t = evaluation.terms(group);
+        let [x, y, z] = t.p_in_camera;
+        let [a, c] = [0, 1].map(|k| evaluation.focal[k] * t.inverse_z * t.pixel_weight);
+        let (b, d) = (-(a * x * t.inverse_z), -(c * y * t.inverse_z));
+        let e = -(t.inverse_z * t.inverse_z * t.depth_weight);
+        // Rows of the Jacobian; the other entries are zero.
+        sums.add_row([0, 2, 3, 4, 5], [a, b, b * y, a * z - b * x, -(a * y)], t.robust_pixel, t.residual[0]);
+        sums.add_row([1, 2, 3, 4, 5], [c, d, d * y - c * z, -(d * x), c * x], t.robust_pixel, t.residual[1]);
+        sums.add_row([2, 3, 4], [e, e * y, -(e * x)], t.robust_depth, t.residual[2]);
+        cost += t.cost;
     }
+    let mut hessian = Matrix6::zeros();
+    for row in 0..6 {
+        for column in 0..=row {
+            hessian[(row, column)] = sums.hessian[entry(row, column)].sum();
+        }
+    }
+    hessian.fill_upper_triangle_with_lower_triangle();
+    NormalEquations { hessian, gradient: Vector6::from_fn(|k, _| sums.gradient[k].sum()), cost: cost.sum() }
 }
 
 struct Sums {
@@ -338,10 +328,14 @@ mod tests {
     fn observations(random: &mut fastrand::Rng, count: usize) -> (Vec<PoseObservation>, Vec<InlierClass>) {
         let mut number = |low: f64, high: f64| low + (high - low) * random.f64();
         let observation = |i: usize| PoseObservation {
-            point_in_world: Point3::new(number(-1.0, 1.0), number(-1.0, 1.0), number(if i % 7 == 0 { -2.0 } else { 1.0 }, 4.0)),
+            point_in_world: Point3::new(
+                number(-1.0, 1.0),
+                number(-1.0, 1.0),
+                number(if i.is_multiple_of(7) { -2.0 } else { 1.0 }, 4.0),
+            ),
             measurement: Measurement {
                 pixel: Vector2::new(number(0.0, 640.0), number(0.0, 480.0)),
-                inverse_depth: (i % 3 != 0).then(|| number(0.2, 1.0)),
+                inverse_depth: (!i.is_multiple_of(3)).then(|| number(0.2, 1.0)),
                 pixel_weight: number(0.02, 1.0),
                 depth_weight: number(1.0, 40.0),
             },
