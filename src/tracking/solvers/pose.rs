@@ -6,7 +6,7 @@
 use nalgebra::{Matrix6, Point3, Vector6};
 
 use crate::geometry::{Pinhole, Se3, se3};
-use crate::tracking::solvers::normal_equations::{GroupedObservations, NormalEquations};
+use crate::tracking::solvers::pose_equations::{GroupedObservations, NormalEquations};
 use crate::tracking::solvers::residual::{InlierClass, Measurement};
 
 const ROUNDS: usize = 4;
@@ -92,7 +92,7 @@ pub fn median_squared(pinhole: &Pinhole, pose: &Se3, observations: &[PoseObserva
     if squared.is_empty() { 0.0 } else { *squared.select_nth_unstable_by(middle, f64::total_cmp).1 }
 }
 
-/// Levenberg-Marquardt until a step is below `converged`.
+/// Levenberg-Marquardt until a step is below `converged`, [`STEPS_PER_ROUND`] steps at most.
 fn refine(
     pinhole: &Pinhole,
     initial: &Se3,

@@ -1,5 +1,5 @@
 //! Normal equations of one camera's pose, four observations at a time, in the widest vectors of the processor. Sums run in a fixed order: they do not
-//! depend on the processor.
+//! depend on the processor. `pose.rs` solves them.
 
 use std::ops::{Add, AddAssign, Mul, Neg, Sub};
 
@@ -42,7 +42,7 @@ pub struct GroupedObservations {
     robust: bool,
 }
 
-/// Of a left perturbation of `camera_from_world` (metres, radians).
+/// Normal equations of a left perturbation of `camera_from_world` (metres, radians).
 #[derive(Clone, Copy, Debug)]
 pub struct NormalEquations {
     pub hessian: Matrix6<f64>,
