@@ -40,6 +40,8 @@ pub struct ReplayRow {
     pub ate_rmse_m: Option<f64>,
     /// Mean time from frame to frame, milliseconds: decoding, features and tracking, beside each other.
     pub ms_per_frame: f64,
+    /// Time after the last frame, milliseconds: the adjustment of all keyframes, and the poses of frames by its result.
+    pub final_ms: f64,
 }
 
 impl ReplayRow {
@@ -66,6 +68,8 @@ pub struct Distribution {
     pub lost_percent: f64,
     /// Mean time from frame to frame, milliseconds: decoding, features and tracking, beside each other.
     pub ms_per_frame: f64,
+    /// Mean time after the last frame, milliseconds a frame.
+    pub final_ms_per_frame: f64,
     /// All errors, centimetres, ascending.
     errors_cm: Vec<f64>,
 }
@@ -86,6 +90,7 @@ impl Distribution {
             worst_cm: errors_cm[n - 1],
             lost_percent: 100.0 * rows.iter().map(|row| row.lost).sum::<usize>() as f64 / frames,
             ms_per_frame: rows.iter().map(|row| row.ms_per_frame * row.frames as f64).sum::<f64>() / frames,
+            final_ms_per_frame: rows.iter().map(|row| row.final_ms).sum::<f64>() / frames,
             errors_cm,
         }
     }
@@ -188,17 +193,19 @@ fn ratio_by_chance(errors: &[f64], variants: usize) -> f64 {
 
 /// All rows as CSV with a header.
 pub fn to_csv(rows: &[ReplayRow]) -> String {
-    let mut csv =
-        String::from("recording,variant,start,backwards,every,missing_percent,frames,lost,keyframes,ate_rmse_m,ms_per_frame\n");
+    let mut csv = String::from(
+        "recording,variant,start,backwards,every,missing_percent,frames,lost,keyframes,ate_rmse_m,ms_per_frame,final_ms\n",
+    );
     for row in rows {
         let ReplayRow { recording, variant, start, backwards, every, missing_percent, frames, lost, keyframes, .. } = row;
         let ate = row.ate_rmse_m.map_or_else(String::new, |metres| format!("{metres:.6}"));
         let _ = writeln!(
             csv,
-            "{},{},{start},{backwards},{every},{missing_percent},{frames},{lost},{keyframes},{ate},{:.3}",
+            "{},{},{start},{backwards},{every},{missing_percent},{frames},{lost},{keyframes},{ate},{:.3},{:.3}",
             quoted(recording),
             quoted(variant),
-            row.ms_per_frame
+            row.ms_per_frame,
+            row.final_ms
         );
     }
     csv
@@ -222,14 +229,14 @@ pub fn write(folder: &Path, rows: &[ReplayRow]) -> Result<String, ReportError> {
 pub fn to_markdown(all: &[Distribution]) -> String {
     let cm = |value: f64| if value.is_finite() { format!("{value:.2}") } else { "failed".into() };
     let mut text = String::from(
-        "| recording | settings | replays | ATE RMSE, cm: median | worst quarter | worst | lost, % | ms a frame |\n|---|---|---|---|---|---|---|---|\n",
+        "| recording | settings | replays | ATE RMSE, cm: median | worst quarter | worst | lost, % | ms a frame | ms a frame at the end |\n|---|---|---|---|---|---|---|---|---|\n",
     );
     for d in all {
         let (median, quarter, worst) = (cm(d.median_cm), cm(d.worst_quarter_cm), cm(d.worst_cm));
         let _ = writeln!(
             text,
-            "| {} | {} | {} | {median} | {quarter} | {worst} | {:.1} | {:.1} |",
-            d.recording, d.variant, d.replays, d.lost_percent, d.ms_per_frame
+            "| {} | {} | {} | {median} | {quarter} | {worst} | {:.1} | {:.1} | {:.1} |",
+            d.recording, d.variant, d.replays, d.lost_percent, d.ms_per_frame, d.final_ms_per_frame
         );
     }
     let variants = names(all, |d| &d.variant);
@@ -325,6 +332,7 @@ mod tests {
             keyframes: 10,
             ate_rmse_m: ate_cm.is_finite().then_some(ate_cm / 100.0),
             ms_per_frame: 10.0,
+            final_ms: 200.0,
         }
     }
 

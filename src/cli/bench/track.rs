@@ -223,7 +223,7 @@ impl Replay<'_> {
         let mut tracker = Tracker::new(self.sequence.camera, self.sequence.sensor, config).into_diagnostic()?;
         let front_end = FrontEnd::new(self.sequence.camera, self.sequence.sensor, config);
         let started = Instant::now();
-        std::thread::scope(|scope| {
+        let times = std::thread::scope(|scope| {
             let (sender, extracted) = bounded(AHEAD);
             let (frames, front_end) = (&frames, &front_end);
             scope.spawn(move || {
@@ -241,17 +241,15 @@ impl Replay<'_> {
             });
             for frame in extracted {
                 if is_leaving() {
-                    return Ok(());
+                    return Ok(None);
                 }
                 tracker.track_extracted(&frame.into_diagnostic()?, true).into_diagnostic()?;
             }
+            let tracked = started.elapsed();
             tracker.finish().into_diagnostic()?;
-            Ok::<_, miette::Report>(())
+            Ok::<_, miette::Report>(Some((tracked, started.elapsed() - tracked)))
         })?;
-        if is_leaving() {
-            return Ok(None);
-        }
-        let ms_per_frame = 1e3 * started.elapsed().as_secs_f64() / frames.len().max(1) as f64;
+        let Some((tracked, after)) = times else { return Ok(None) };
         let mut poses: Vec<_> = tracker.trajectory().into_iter().map(|(_, pose)| pose).collect();
         poses.sort_by(|a, b| a.timestamp_s.total_cmp(&b.timestamp_s));
         let lost = frames.len() - poses.len();
@@ -270,7 +268,8 @@ impl Replay<'_> {
             lost,
             keyframes: tracker.keyframe_count(),
             ate_rmse_m: errors.ok().map(|errors| errors.ate_rmse_m),
-            ms_per_frame,
+            ms_per_frame: 1e3 * tracked.as_secs_f64() / frames.len().max(1) as f64,
+            final_ms: 1e3 * after.as_secs_f64(),
         }))
     }
 }

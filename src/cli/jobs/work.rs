@@ -123,7 +123,7 @@ fn write_replay(task: &ReplayTask, folder: &Path, signals: &Signals) -> Result<M
     let row = track::replay(task, &|| signals.is_leaving()).map_err(bad_input)?.ok_or(WorkError::Interrupted)?;
     let text = serde_json::to_string(&row).map_err(failed)?;
     keysplat::files::write_durably(&folder.join(ReplayRow::FILE), text.as_bytes()).map_err(failed)?;
-    let figures = serde_json::to_value(ReplayRow { ms_per_frame: 0.0, ..row }).map_err(failed)?;
+    let figures = serde_json::to_value(ReplayRow { ms_per_frame: 0.0, final_ms: 0.0, ..row }).map_err(failed)?;
     Ok(Made { figures, files: Vec::new(), timed_files: vec![ReplayRow::FILE.into()] })
 }
 

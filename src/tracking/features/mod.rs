@@ -9,4 +9,5 @@ pub mod orb;
 pub mod orientation;
 pub mod projection;
 pub mod quadtree;
+pub mod steered_brief;
 pub mod stereo;

@@ -1,14 +1,13 @@
 //! ORB features spread evenly over the image (Rublee et al., *ORB*, ICCV 2011; the even spread after Mur-Artal & Tardós,
 //! *ORB-SLAM2*, 2017).
 //!
-//! FAST corners are found on each pyramid level, with a lower threshold where there is no texture; a quadtree chooses among them. OpenCV computes
-//! the descriptors of those that stay. Levels are worked on in parallel, each by itself: the result does not depend on threads.
+//! FAST corners are found on each pyramid level, with a lower threshold where there is no texture; a quadtree chooses among them, and those that stay
+//! get an orientation and a descriptor. Levels are worked on in parallel, each by itself: the result does not depend on threads.
 
 use std::sync::Once;
 
 use nalgebra::Vector2;
-use opencv::core::{KeyPoint, Mat, MatTraitConst, MatTraitConstManual, Size, Vector};
-use opencv::features2d::{self, Feature2DTrait};
+use opencv::core::{Mat, MatTraitConst, MatTraitConstManual, Size};
 use opencv::imgproc;
 use rayon::prelude::*;
 
@@ -16,6 +15,7 @@ use crate::tracking::features::descriptor::Descriptor;
 use crate::tracking::features::fast::{self, Window, find_corners};
 use crate::tracking::features::orientation::{OrientationPatch, PATCH_RADIUS};
 use crate::tracking::features::quadtree::{Corner, distribute};
+use crate::tracking::features::steered_brief::{SamplingPattern, SmoothedImage};
 use crate::tracking::{TrackingConfig, TrackingError};
 
 /// Pixels at a level's border without features: the descriptor's patch (31 pixels) must fit.
@@ -130,28 +130,18 @@ impl Extractor {
             return Ok(Vec::new());
         }
         let angles = self.patch.angles(&pixels, &corners);
-        let mut keypoints: Vector<KeyPoint> = Vector::with_capacity(corners.len());
-        for (corner, angle_rad) in corners.iter().zip(&angles) {
-            let (x, y) = (corner.x as f32, corner.y as f32);
-            keypoints.push(KeyPoint::new_coords(x, y, 31.0, angle_rad.to_degrees(), corner.score, 0, -1)?);
-        }
-        let mut orb = features2d::ORB::create(1, 1.2, 1, BORDER, 0, 2, features2d::ORB_ScoreType::FAST_SCORE, 31, 20)?;
-        let mut descriptors = Mat::default();
-        // A row for each: no corner lies on the border that it leaves out.
-        orb.compute(image, &mut keypoints, &mut descriptors)?;
+        let descriptors = SamplingPattern::get()?.describe(&SmoothedImage::new(image)?, &corners, &angles)?;
         // Pixel centres stay where they belong when an image is resized: (x + ½)·s − ½.
         let full = self.levels[0].size;
         let sx = f64::from(full.width) / f64::from(image.cols());
         let sy = f64::from(full.height) / f64::from(image.rows());
-        let keypoint = |(row, (corner, angle_rad)): (usize, (&Corner, &f32))| {
-            Ok(Keypoint {
-                pixel: Vector2::new((f64::from(corner.x) + 0.5) * sx - 0.5, (f64::from(corner.y) + 0.5) * sy - 0.5),
-                octave: octave as u8,
-                angle_rad: *angle_rad,
-                descriptor: Descriptor::from_bytes(descriptors.at_row::<u8>(row as i32)?),
-            })
+        let keypoint = |((corner, angle_rad), descriptor): ((&Corner, f32), Descriptor)| Keypoint {
+            pixel: Vector2::new((f64::from(corner.x) + 0.5) * sx - 0.5, (f64::from(corner.y) + 0.5) * sy - 0.5),
+            octave: octave as u8,
+            angle_rad,
+            descriptor,
         };
-        corners.iter().zip(&angles).enumerate().map(keypoint).collect()
+        Ok(corners.iter().zip(angles).zip(descriptors).map(keypoint).collect())
     }
 
     /// All FAST corners inside the border; squares without any are searched again with the lower threshold.
