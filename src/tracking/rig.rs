@@ -50,4 +50,9 @@ impl Rig {
     pub fn octave_scale(&self, octave: u8) -> f64 {
         self.octave_scales[usize::from(octave)]
     }
+
+    /// The finest octave of at least this scale; the coarsest if none is.
+    pub fn octave_of_scale(&self, scale: f64) -> u8 {
+        self.octave_scales.partition_point(|octave| *octave < scale).min(self.octave_scales.len() - 1) as u8
+    }
 }

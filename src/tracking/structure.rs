@@ -71,8 +71,8 @@ impl PosedView {
         Ok(Self { camera_from_world: world_from_camera.inverse(), pinhole, features, colors })
     }
 
-    fn candidates<'a>(&'a self, features: &'a [Feature]) -> Candidates<'a> {
-        Candidates { features, wanted: (0..features.len()).collect(), camera_from_world: &self.camera_from_world }
+    fn candidates<'a>(&'a self, features: &'a [Feature], rig: &Rig) -> Candidates<'a> {
+        Candidates::new(features, 0..features.len(), &self.camera_from_world, rig)
     }
 
     fn centre(&self) -> Point3<f64> {
@@ -89,7 +89,8 @@ pub fn triangulate_views(views: &[PosedView], config: &TrackingConfig) -> Vec<Ve
     let Some(first) = views.first() else { return Vec::new() };
     let rig = Rig::new(first.pinhole, config.clone());
     let features: Vec<Vec<Feature>> = views.iter().map(|view| features_in(view, &rig.pinhole)).collect();
-    let candidates: Vec<Candidates<'_>> = views.iter().zip(&features).map(|(view, features)| view.candidates(features)).collect();
+    let candidates: Vec<Candidates<'_>> =
+        views.iter().zip(&features).map(|(view, features)| view.candidates(features, &rig)).collect();
     (0..views.len()).into_par_iter().map(|index| points_of(views, &candidates, index, &rig)).collect()
 }
 

@@ -12,7 +12,7 @@ use crate::tracking::TrackingConfig;
 use crate::tracking::map::sparse_map::{Map, Observation};
 use crate::tracking::map::tally::distinct;
 use crate::tracking::rig::Rig;
-use crate::tracking::solvers::bundle::{BundleObservation, BundleProblem};
+use crate::tracking::solvers::bundle::{BundleObservation, BundleProblem, CONVERGED};
 use crate::tracking::solvers::depth_bias::{BiasPrior, DepthBias};
 use crate::tracking::solvers::relative_pose::RelativePose;
 use crate::tracking::solvers::residual::{InlierClass, Measurement};
@@ -21,6 +21,8 @@ use crate::tracking::solvers::residual::{InlierClass, Measurement};
 const MIN_SHARED: usize = 15;
 /// Keyframes that hold the window in place, at most; bounds the time.
 const MAX_FIXED: usize = 40;
+/// As [`CONVERGED`] for a window: the next one goes on from there.
+const CONVERGED_WINDOW: f64 = 3e-3;
 
 /// A frame between keyframes that holds landmarks as well.
 #[derive(Clone, Debug)]
@@ -48,13 +50,15 @@ pub struct Adjustment {
     /// Keyframes in the map when it was made, and corrections of the whole until then.
     known: usize,
     corrections: usize,
+    /// Share of the cost by which a step must lower it to be followed by another.
+    converged_share: f64,
 }
 
 impl Adjustment {
     /// Local bundle adjustment around `keyframe`; `None` if nothing in its window may move.
     pub fn of_window(map: &Map, keyframe: usize, rig: &Rig) -> Option<Self> {
         let (free, fixed) = choose_window(map, keyframe, &rig.config);
-        Self::new(map, &free, &fixed, rig)
+        Some(Self { converged_share: CONVERGED_WINDOW, ..Self::new(map, &free, &fixed, rig)? })
     }
 
     /// Global bundle adjustment of the submap that begins with `root`; `None` if it has more observations than that. Few landmarks would tear a
@@ -94,6 +98,7 @@ impl Adjustment {
             observations,
             known,
             corrections,
+            converged_share: CONVERGED,
         })
     }
 
@@ -147,7 +152,7 @@ impl Adjustment {
     /// Moves poses and points to where they agree best, twice: outliers are found by the first round and left out of the second.
     pub fn solve(&mut self, pinhole: &Pinhole, steps: usize) {
         for _ in 0..2 {
-            self.problem.solve(pinhole, steps);
+            self.problem.solve(pinhole, steps, self.converged_share);
             self.problem.classify(pinhole);
         }
     }

@@ -46,8 +46,11 @@ impl DenseSampler {
     pub fn sample(&self, grey: &[u8], depth: &DepthImage, config: &TrackingConfig) -> DenseFrame {
         let width = depth.width as usize;
         let mean = |(x, y): (u32, u32)| {
-            let rows = (y as usize - 1..=y as usize + 2).map(|v| &grey[v * width + x as usize - 1..=v * width + x as usize + 2]);
-            rows.flatten().map(|g| f32::from(*g)).sum::<f32>() / 16.0
+            let row = |v: usize| -> &[u8; 4] {
+                grey[v * width + x as usize - 1..].first_chunk().expect("four pixels inside the image")
+            };
+            let sum: u16 = (y as usize - 1..y as usize + 3).map(|v| row(v).iter().map(|g| u16::from(*g)).sum::<u16>()).sum();
+            f32::from(sum) / 16.0
         };
         let metres = |(x, y): (u32, u32)| {
             let found = depth.at(x, y).unwrap_or_default();

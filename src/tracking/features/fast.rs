@@ -84,8 +84,11 @@ impl Search<'_> {
             // All lanes lie in the image.
             let start = x.min(self.image.width - RADIUS - LANES);
             let Some(scores) = self.scores(y * self.image.width + start) else { continue };
-            let count = LANES.min(columns.end - x);
-            row[x - columns.start..][..count].copy_from_slice(&scores[x - start..][..count]);
+            let (row, count) = (&mut row[x - columns.start..], LANES.min(columns.end - x));
+            match row.first_chunk_mut() {
+                Some(row) if count == LANES => *row = scores,
+                _ => row[..count].copy_from_slice(&scores[x - start..][..count]),
+            }
         }
     }
 

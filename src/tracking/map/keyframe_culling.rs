@@ -44,7 +44,7 @@ fn is_redundant(map: &Map, keyframe: usize) -> bool {
         let own = octave(&Observation { keyframe, feature });
         let finer = |s: &&Observation| s.keyframe != keyframe && octave(s) <= own + COARSER;
         seen += 1;
-        elsewhere += usize::from(map.landmarks[*landmark].observations.iter().filter(finer).count() >= OTHERS);
+        elsewhere += usize::from(map.landmarks[*landmark].observations.iter().filter(finer).nth(OTHERS - 1).is_some());
     }
     elsewhere as f64 >= REDUNDANT_SHARE * f64::from(seen) && seen > 0
 }

@@ -55,7 +55,7 @@ impl Map {
 
     /// Where a camera should see a landmark; `None` outside of its image, its range of distances or its viewing directions.
     fn predict(&self, landmark: usize, camera_from_world: &Se3, rig: &Rig) -> Option<Projection> {
-        let Rig { pinhole, config, .. } = rig;
+        let pinhole = &rig.pinhole;
         let l = &self.landmarks[landmark];
         let anchor = &self.keyframes[l.anchor];
         let p_in_camera = (camera_from_world * self.position(landmark)).coords;
@@ -70,12 +70,10 @@ impl Map {
         if view_cosine < MIN_VIEW_COSINE {
             return None;
         }
-        let octave = ((furthest / distance).ln() / config.pyramid_scale.ln()).ceil();
-        let octave = octave.clamp(0.0, config.pyramid_levels as f64 - 1.0) as u8;
         Some(Projection {
             point: landmark,
             pixel,
-            octave,
+            octave: rig.octave_of_scale(furthest / distance),
             view_cosine,
             inverse_depth: 1.0 / p_in_camera.z,
             descriptor: l.descriptor,

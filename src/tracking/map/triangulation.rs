@@ -71,17 +71,37 @@ pub fn triangulate(a: &View<'_>, at_a: &Vector2<f64>, b: &View<'_>, at_b: &Vecto
 /// Features of a view with a known pose, and which of them to match.
 #[derive(Clone, Debug)]
 pub struct Candidates<'a> {
-    pub features: &'a [Feature],
-    /// Indices of features.
-    pub wanted: Vec<usize>,
-    pub camera_from_world: &'a Se3,
+    features: &'a [Feature],
+    /// A search reads them in a row.
+    wanted: Vec<Candidate>,
+    camera_from_world: &'a Se3,
+}
+
+/// A feature to be matched.
+#[derive(Clone, Copy, Debug)]
+struct Candidate {
+    index: usize,
+    pixel: Vector2<f64>,
+    /// Squared distance from its epipolar line up to which it may lie on it, pixels².
+    slack: f64,
+    octave: u8,
 }
 
 impl<'a> Candidates<'a> {
+    /// Features by their indices.
+    pub fn new(features: &'a [Feature], wanted: impl Iterator<Item = usize>, camera_from_world: &'a Se3, rig: &Rig) -> Self {
+        let candidate = |index: usize| {
+            let Feature { pixel, octave, .. } = features[index];
+            let sigma = rig.pixel_sigma(octave);
+            Candidate { index, pixel, slack: CHI2_LINE * sigma * sigma, octave }
+        };
+        Self { features, wanted: wanted.map(candidate).collect(), camera_from_world }
+    }
+
     /// The features of a keyframe that show no landmark yet.
-    fn free(keyframe: &'a Keyframe) -> Self {
-        let wanted = (0..keyframe.features.len()).filter(|feature| keyframe.landmarks[*feature].is_none()).collect();
-        Self { features: &keyframe.features.features, wanted, camera_from_world: &keyframe.camera_from_world }
+    fn free(keyframe: &'a Keyframe, rig: &Rig) -> Self {
+        let free = (0..keyframe.features.len()).filter(|feature| keyframe.landmarks[*feature].is_none());
+        Self::new(&keyframe.features.features, free, &keyframe.camera_from_world, rig)
     }
 
     fn view<'b>(&'b self, pinhole: &'b Pinhole) -> View<'b> {
@@ -112,8 +132,8 @@ pub fn triangulate_with_neighbours(map: &mut Map, keyframe: usize, rig: &Rig) ->
         if (this.centre() - other.centre()).norm() < MIN_BASELINE_SHARE * depth {
             continue;
         }
-        for MatchedPoint { mine, theirs, point, .. } in match_along_lines(&Candidates::free(this), &Candidates::free(other), rig)
-        {
+        let (this, other) = (Candidates::free(this, rig), Candidates::free(other, rig));
+        for MatchedPoint { mine, theirs, point, .. } in match_along_lines(&this, &other, rig) {
             let landmark = map.add_landmark(Observation { keyframe, feature: mine }, point, config);
             map.add_observation(landmark, Observation { keyframe: neighbour, feature: theirs });
             map.refresh_geometry(landmark, config);
@@ -128,10 +148,10 @@ pub fn match_along_lines(this: &Candidates<'_>, other: &Candidates<'_>, rig: &Ri
     let pinhole = &rig.pinhole;
     let line_of = fundamental(&(other.camera_from_world * this.camera_from_world.inverse()), pinhole);
     let mut taken: Vec<Option<(u32, MatchedPoint)>> = vec![None; other.features.len()];
-    for &mine in &this.wanted {
+    for &Candidate { index: mine, .. } in &this.wanted {
         let feature = &this.features[mine];
         let line = line_of * feature.pixel.push(1.0);
-        let Some((theirs, distance)) = best_on_line(feature, &line, other, rig) else { continue };
+        let Some((theirs, distance)) = best_on_line(feature, &line, other) else { continue };
         let found = &other.features[theirs];
         let Some(met) = triangulate(&this.view(pinhole), &feature.pixel, &other.view(pinhole), &found.pixel) else { continue };
         let agrees = met.parallax_cosine < MAX_PARALLAX_COSINE && {
@@ -147,23 +167,21 @@ pub fn match_along_lines(this: &Candidates<'_>, other: &Candidates<'_>, rig: &Ri
 }
 
 /// The feature of `other` near the line whose descriptor is clearly the most similar.
-fn best_on_line(feature: &Feature, line: &Vector3<f64>, other: &Candidates<'_>, rig: &Rig) -> Option<(usize, u32)> {
+fn best_on_line(feature: &Feature, line: &Vector3<f64>, other: &Candidates<'_>) -> Option<(usize, u32)> {
     let norm_squared = line.x * line.x + line.y * line.y;
     let (mut best, mut second) = (None::<(usize, u32)>, u32::MAX);
-    for &i in &other.wanted {
-        let candidate = &other.features[i];
-        let off = line.x * candidate.pixel.x + line.y * candidate.pixel.y + line.z;
-        let sigma = rig.pixel_sigma(candidate.octave);
-        let near = off * off <= CHI2_LINE * sigma * sigma * norm_squared;
-        if !near || candidate.octave.abs_diff(feature.octave) > 2 {
+    for Candidate { index, pixel, slack, octave } in &other.wanted {
+        let off = line.x * pixel.x + line.y * pixel.y + line.z;
+        let near = off * off <= slack * norm_squared;
+        if !near || octave.abs_diff(feature.octave) > 2 {
             continue;
         }
-        let distance = candidate.descriptor.distance(&feature.descriptor);
+        let distance = other.features[*index].descriptor.distance(&feature.descriptor);
         match best {
             Some((_, least)) if distance >= least => second = second.min(distance),
             _ => {
                 second = best.map_or(u32::MAX, |(_, least)| least);
-                best = Some((i, distance));
+                best = Some((*index, distance));
             }
         }
     }

@@ -14,8 +14,8 @@ use crate::tracking::solvers::schur::ReducedSystem;
 
 /// Damping that gives up: no step helps any more.
 const MAX_LAMBDA: f64 = 1e6;
-/// A step that lowers the cost by less than this share has converged.
-const CONVERGED_SHARE: f64 = 1e-4;
+/// A step that lowers the cost by less than this share has converged, where nothing follows.
+pub const CONVERGED: f64 = 1e-4;
 
 /// One measurement of a point by a camera.
 #[derive(Clone, Copy, Debug)]
@@ -75,9 +75,9 @@ struct System {
 }
 
 impl BundleProblem {
-    /// Moves poses and points to lower the cost, `steps` Levenberg-Marquardt steps at most. Returns the cost before and after.
-    /// Observations of points that lie behind their cameras to begin with are outliers until the next classification.
-    pub fn solve(&mut self, pinhole: &Pinhole, steps: usize) -> (f64, f64) {
+    /// Moves poses and points to lower the cost, `steps` Levenberg-Marquardt steps at most, until one lowers it by less than `converged_share`. Returns
+    /// the cost before and after. Observations of points that lie behind their cameras to begin with are outliers until the next classification.
+    pub fn solve(&mut self, pinhole: &Pinhole, steps: usize, converged_share: f64) -> (f64, f64) {
         for o in &mut self.observations {
             if o.measurement.residual(pinhole, &(self.poses[o.pose] * self.points[o.point]).coords).is_none() {
                 o.class = InlierClass::Outlier;
@@ -103,7 +103,7 @@ impl BundleProblem {
             }
             let Some(candidate) = lowered else { break };
             lambda = (lambda * 0.2).max(1e-8);
-            let converged = cost - candidate < CONVERGED_SHARE * cost;
+            let converged = cost - candidate < converged_share * cost;
             cost = candidate;
             if converged {
                 break;

@@ -49,7 +49,7 @@ fn worst_pose_error(problem: &BundleProblem, truth: &BundleProblem) -> f64 {
 #[test]
 fn perfect_measurements_give_the_truth() {
     let (mut problem, truth) = scene(0.0, false);
-    let (before, after) = problem.solve(&PINHOLE, 30);
+    let (before, after) = problem.solve(&PINHOLE, 30, CONVERGED);
     assert!(before > 1e4 && after < 1e-6, "{before} → {after}");
     assert!(worst_pose_error(&problem, &truth) < 1e-5);
     let points = problem.points.iter().zip(&truth.points).map(|(a, b)| (a - b).norm()).fold(0.0, f64::max);
@@ -60,9 +60,9 @@ fn perfect_measurements_give_the_truth() {
 fn outliers_are_found_and_do_not_pull() {
     let (mut problem, truth) = scene(0.5, true);
     let start = worst_pose_error(&problem, &truth);
-    problem.solve(&PINHOLE, 10);
+    problem.solve(&PINHOLE, 10, CONVERGED);
     problem.classify(&PINHOLE);
-    problem.solve(&PINHOLE, 10);
+    problem.solve(&PINHOLE, 10, CONVERGED);
     let end = worst_pose_error(&problem, &truth);
     assert!(start > 0.02 && end < 0.003, "{start} → {end}");
     for o in &problem.observations {
@@ -82,7 +82,7 @@ fn measured_relative_poses_hold_cameras_without_points() {
         problem.relative_poses.push(RelativePose { current, reference, current_from_reference, information });
     }
     let before = worst_pose_error(&problem, &truth);
-    problem.solve(&PINHOLE, 30);
+    problem.solve(&PINHOLE, 30, CONVERGED);
     let after = worst_pose_error(&problem, &truth);
     assert!(before > 0.02 && after < 1e-6, "{before} → {after}");
 }
@@ -94,7 +94,7 @@ fn wrong_depths_hardly_pull() {
         // Three standard deviations.
         o.measurement.inverse_depth = o.measurement.inverse_depth.map(|measured| measured - 0.03);
     }
-    problem.solve(&PINHOLE, 50);
+    problem.solve(&PINHOLE, 50, CONVERGED);
     let error = worst_pose_error(&problem, &truth);
     assert!(error < 1e-3, "{error}");
 }
@@ -109,7 +109,7 @@ fn a_bias_of_the_depth_is_found() {
     }
     let mut unaware = problem.clone();
     problem.bias_prior = Some(BiasPrior { mean: DepthBias::default(), information: Vector3::repeat(1e-3) });
-    problem.solve(&PINHOLE, 50);
+    problem.solve(&PINHOLE, 50, CONVERGED);
     unaware.solve(&PINHOLE, 50);
     assert!((problem.depth_bias.0 - bias.0).norm() < 1e-5, "{:?}", problem.depth_bias);
     assert_eq!(unaware.depth_bias, DepthBias::default());
@@ -117,7 +117,7 @@ fn a_bias_of_the_depth_is_found() {
     assert!(error < 1e-5 && without > 1e-3, "{error} {without}");
     // A prior that is certain keeps it.
     problem.bias_prior = Some(BiasPrior { mean: DepthBias::default(), information: Vector3::repeat(1e15) });
-    problem.solve(&PINHOLE, 50);
+    problem.solve(&PINHOLE, 50, CONVERGED);
     assert!(problem.depth_bias.0.norm() < 1e-6, "{:?}", problem.depth_bias);
 }
 
@@ -131,7 +131,7 @@ fn the_offset_of_a_pairs_disparities_is_found_and_no_tilt() {
     }
     let mut unaware = problem.clone();
     problem.bias_prior = Some(BiasPrior::of_pair(SCALE));
-    problem.solve(&PINHOLE, 50);
+    problem.solve(&PINHOLE, 50, CONVERGED);
     unaware.solve(&PINHOLE, 50);
     let found = problem.depth_bias.0;
     // The prior holds it back: these are a few dozen points.

@@ -7,6 +7,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use nalgebra::Vector2;
+use rayon::prelude::*;
 
 use super::{Tracker, keyframe_selection};
 use crate::geometry::Se3;
@@ -148,8 +149,11 @@ impl Record {
         KeyframePose { frame_index: self.frame_index, timestamp_s: self.timestamp_s, world_from_camera: self.pose(map).inverse() }
     }
 
-    /// Solves the pose by the landmarks as they are now; `false` where too few are left or agree.
+    /// Solves the pose by the landmarks as they are now; `false` for keyframes, and where too few are left or agree.
     fn settle(&mut self, map: &Map, rig: &Rig) -> bool {
+        if map.keyframes[self.reference].frame_index == self.frame_index {
+            return false;
+        }
         let prior = self.sightings.prior(map);
         let found = optimise_pose(&rig.pinhole, &self.pose(map), prior.as_ref(), &self.sightings.observations(map, rig));
         let needed = (LEAST_AGREEING * self.sightings.seen.len() as f64).max(rig.config.min_inliers as f64);
@@ -204,16 +208,18 @@ impl Tracker {
         for _ in 0..SETTLED_A_FRAME {
             let is_old = self.records.get(self.frames.settled).is_some_and(|record| record.reference < end);
             if is_old || self.records.len() > self.frames.settled + MOST_WAITING {
-                self.settle_next();
+                let moved = self.records[self.frames.settled].settle(&self.map, &self.rig);
+                self.note_settled(moved);
             }
         }
     }
 
-    /// Solves the poses of all frames that are left.
+    /// Solves the poses of all frames that are left, on all cores.
     pub(super) fn settle_all_frames(&mut self) {
-        while self.frames.settled < self.records.len() {
-            self.settle_next();
-        }
+        let (map, rig) = (&self.map, &self.rig);
+        let left = self.records[self.frames.settled..].par_iter_mut();
+        let moved: Vec<bool> = left.map(|record| record.settle(map, rig)).collect();
+        moved.into_iter().for_each(|moved| self.note_settled(moved));
     }
 
     /// Frames between the keyframes of a submap, for bundle adjustment: evenly, with so many observations at most.
@@ -266,11 +272,10 @@ impl Tracker {
         }
     }
 
-    fn settle_next(&mut self) {
+    /// Notes that the next frame has been solved, and whether its pose is another.
+    fn note_settled(&mut self, moved: bool) {
         let settled = self.frames.settled;
-        let record = &mut self.records[settled];
-        let is_keyframe = self.map.keyframes[record.reference].frame_index == record.frame_index;
-        let moved = !is_keyframe && record.settle(&self.map, &self.rig);
+        let record = &self.records[settled];
         if moved && self.frames.images_of(record.reference).binary_search(&settled).is_ok() {
             self.frames.moved.insert(settled);
         }

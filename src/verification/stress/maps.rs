@@ -11,7 +11,7 @@ use super::scenes::gauss;
 use super::{Family, Outcome, Part};
 use crate::geometry::sim3::Vector7;
 use crate::geometry::{Se3, Sim3, align, se3, sim3};
-use crate::tracking::solvers::bundle::{BundleObservation, BundleProblem};
+use crate::tracking::solvers::bundle::{BundleObservation, BundleProblem, CONVERGED};
 use crate::tracking::solvers::pose_graph::{Edge, PoseGraph};
 use crate::tracking::solvers::sim3_alignment::{Pair, align_pairs};
 
@@ -90,10 +90,10 @@ fn bundle(rng: &mut Rng, world: &World, with_depth: bool, metres: f64, behind: u
 fn solve_bundle(problem: &mut BundleProblem, truth: &mut BundleProblem, world: &World) -> Outcome {
     let mut outcome = Outcome::default();
     for _ in 0..2 {
-        problem.solve(&PINHOLE, STEPS);
+        problem.solve(&PINHOLE, STEPS, CONVERGED);
         problem.classify(&PINHOLE);
     }
-    let (_, cost) = problem.solve(&PINHOLE, STEPS);
+    let (_, cost) = problem.solve(&PINHOLE, STEPS, CONVERGED);
     truth.observations.clone_from(&problem.observations);
     let least = truth.cost(&PINHOLE);
     let trusted = problem.observations.iter().filter(|o| o.measurement.restricted_to(o.class).is_some()).count();
