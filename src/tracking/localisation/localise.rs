@@ -23,8 +23,6 @@ const MOTION_SEARCH: ProjectionSearch =
 /// Matches that end the widening of the search, and least inliers of its pose.
 const MOTION_MATCHES: usize = 40;
 const MOTION_INLIERS: usize = 15;
-/// Landmarks of the last frame that predict the next one by themselves.
-const ENOUGH_LANDMARKS: usize = 200;
 /// Inliers that make it worth to look more closely around a rough pose.
 const ROUGH_INLIERS: usize = 8;
 /// Search radius around landmarks, pixels at the finest level: seen from about the known direction, and otherwise.
@@ -35,7 +33,7 @@ const STRAIGHT_COSINE: f64 = 0.998;
 /// The radius grows by this where the pose is rough.
 const ROUGH_FACTOR: f64 = 2.5;
 const MAP_RULES: Rules = Rules { max_distance: 80, ratio: 0.8, check_rotation: false };
-/// The local map: keyframes that see the frame's landmarks, and the links of those that see most.
+/// The local map: keyframes that see the frame's landmarks, and the neighbours of those that see most.
 const LOCAL_KEYFRAMES: usize = 20;
 const LOCAL_NEAREST: usize = 5;
 /// Inliers from which on landmarks hold a pose that has a prior.
@@ -127,11 +125,10 @@ impl Context<'_> {
         (found.inliers >= MOTION_INLIERS).then_some(found)
     }
 
-    /// The last frame as a view: its landmarks, and temporary points from depth for its other features where landmarks are few.
+    /// The last frame as a view: its landmarks, and temporary points from depth for its other features.
     pub fn view_of_last(&self, last: &LastFrame) -> View {
         let world_from_camera = last.camera_from_world.inverse();
-        let few = last.landmarks.iter().flatten().count() < ENOUGH_LANDMARKS;
-        let temporary = |i| last.features.point_in_camera(i, self.rig).filter(|_| few).map(|p| world_from_camera * p);
+        let temporary = |i| last.features.point_in_camera(i, self.rig).map(|p| world_from_camera * p);
         let point = |i: usize| last.landmarks[i].map(|l| self.map.position(l)).or_else(|| temporary(i));
         View {
             features: last.features.clone(),
@@ -272,7 +269,7 @@ impl Context<'_> {
             keyframes.push(reference);
         }
         for (keyframe, _) in observing.iter().take(LOCAL_NEAREST) {
-            for (neighbour, _) in &self.map.keyframes[*keyframe].links {
+            for neighbour in &self.map.keyframes[*keyframe].neighbours {
                 if !keyframes.contains(neighbour) {
                     keyframes.push(*neighbour);
                 }

@@ -46,7 +46,8 @@ impl Map {
         let nothing = self.no_features.clone();
         let given_up = &mut self.keyframes[keyframe];
         let features = std::mem::replace(&mut given_up.features, nothing);
-        (given_up.links, given_up.relative_poses, given_up.landmarks) = (Vec::new(), Vec::new(), Vec::new());
+        (given_up.links, given_up.neighbours) = (Vec::new(), Vec::new());
+        (given_up.relative_poses, given_up.landmarks) = (Vec::new(), Vec::new());
         self.dense_bytes -= given_up.dense.take().map_or(0, |dense| dense.bytes());
         self.database.remove(keyframe, &features.features);
         self.living.remove(&keyframe);

@@ -25,6 +25,8 @@ pub struct Keyframe {
     pub travelled: Travelled,
     /// Older keyframes that share most landmarks with it and how many, strongest first, as of its last bundle adjustment.
     pub links: Vec<(usize, usize)>,
+    /// Keyframes, older and newer, that share most landmarks with it, strongest first, as of then or of its beginning.
+    pub neighbours: Vec<usize>,
     pub features: Arc<FrameFeatures>,
     /// Its pixels: where landmarks are few, and of the first in a submap, if there is depth.
     pub dense: Option<Arc<DenseFrame>>,
@@ -53,6 +55,7 @@ impl Keyframe {
             unit: 1.0,
             travelled: Travelled::default(),
             links: Vec::new(),
+            neighbours: Vec::new(),
             landmarks: vec![None; features.len()],
             features,
             dense: None,

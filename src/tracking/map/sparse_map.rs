@@ -21,7 +21,7 @@ use crate::tracking::map::tally::{distinct, tally};
 use crate::tracking::map::trim;
 use crate::tracking::solvers::relative_pose::RelativePose;
 
-/// Links that a keyframe keeps.
+/// Links that a keyframe keeps, and neighbours.
 const MOST_LINKS: usize = 5;
 /// Keyframes after a frame's reference until the frame's pose is solved again.
 pub const SETTLED_AFTER: usize = 12;
@@ -64,6 +64,7 @@ impl Map {
         for mut keyframe in other.keyframes {
             keyframe.root += keyframes;
             keyframe.camera_from_world *= other_from_world;
+            keyframe.neighbours.iter_mut().for_each(|k| *k += keyframes);
             keyframe.landmarks.iter_mut().flatten().for_each(|l| *l += landmarks);
             for relative in &mut keyframe.relative_poses {
                 relative.current += keyframes;
@@ -283,9 +284,16 @@ impl Map {
         self.keyframes[keyframe].root == keyframe
     }
 
-    /// Notes which older keyframes share most landmarks with a keyframe.
+    /// Notes which keyframes share most landmarks with a keyframe; returns all that do, as [`Self::covisible`].
+    pub fn refresh_neighbours(&mut self, keyframe: usize) -> Vec<(usize, usize)> {
+        let covisible = self.covisible(keyframe);
+        self.keyframes[keyframe].neighbours = covisible.iter().map(|(other, _)| *other).take(MOST_LINKS).collect();
+        covisible
+    }
+
+    /// Notes which keyframes share most landmarks with a keyframe, and which of the older ones do.
     pub fn refresh_links(&mut self, keyframe: usize) {
-        let older = self.covisible(keyframe).into_iter().filter(|(other, _)| *other < keyframe);
+        let older = self.refresh_neighbours(keyframe).into_iter().filter(|(other, _)| *other < keyframe);
         self.keyframes[keyframe].links = older.take(MOST_LINKS).collect();
     }
 

@@ -338,6 +338,7 @@ impl Tracker {
         triangulation::triangulate_with_neighbours(&mut self.map, id, &self.rig);
         insertion::fuse_with_neighbours(&mut self.map, id, &self.rig);
         insertion::cull_recent_landmarks(&mut self.map, id);
+        self.map.refresh_neighbours(id);
         times.mapping_ms += milliseconds(clock);
         self.motion.reference = id;
         self.records.pop();
