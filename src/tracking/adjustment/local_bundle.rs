@@ -21,8 +21,8 @@ use crate::tracking::solvers::residual::{InlierClass, Measurement};
 const MIN_SHARED: usize = 15;
 /// Keyframes that hold the window in place, at most; bounds the time.
 const MAX_FIXED: usize = 40;
-/// As [`CONVERGED`] for a window: the next one goes on from there.
-const CONVERGED_WINDOW: f64 = 3e-3;
+/// As [`CONVERGED`] for a window that landmarks alone hold: it gains little by more steps, and the next window goes on from there.
+const CONVERGED_HELD: f64 = 3e-3;
 
 /// A frame between keyframes that holds landmarks as well.
 #[derive(Clone, Debug)]
@@ -58,7 +58,9 @@ impl Adjustment {
     /// Local bundle adjustment around `keyframe`; `None` if nothing in its window may move.
     pub fn of_window(map: &Map, keyframe: usize, rig: &Rig) -> Option<Self> {
         let (free, fixed) = choose_window(map, keyframe, &rig.config);
-        Some(Self { converged_share: CONVERGED_WINDOW, ..Self::new(map, &free, &fixed, rig)? })
+        let window = Self::new(map, &free, &fixed, rig)?;
+        let is_held = window.problem.relative_poses.is_empty();
+        Some(Self { converged_share: if is_held { CONVERGED_HELD } else { CONVERGED }, ..window })
     }
 
     /// Global bundle adjustment of the submap that begins with `root`; `None` if it has more observations than that. Few landmarks would tear a
