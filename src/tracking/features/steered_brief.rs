@@ -1,7 +1,7 @@
 //! Descriptors of corners: each bit compares the brightness of two pixels of a smoothed patch, turned by the corner's angle (Rublee et al., *ORB*, ICCV
 //! 2011, sec. 4).
 //!
-//! The pairs of pixels are OpenCV's, which learned them, and so are the descriptors. OpenCV does not tell its pairs: they are read from its
+//! The pairs of pixels are OpenCV's, which were learned, and so are the descriptors. OpenCV has no accessor for its pairs: they are read from its
 //! descriptors of images with a single bright or dark pixel.
 
 use std::sync::OnceLock;
@@ -19,7 +19,7 @@ use crate::tracking::features::orb::LevelImage;
 use crate::tracking::features::orientation::PATCH_RADIUS;
 use crate::tracking::features::quadtree::Corner;
 
-/// Pixels around a smoothed image: a corner at its border has pixels that far outside, in the corners of its turned patch.
+/// Pixels around a smoothed image. The corners of a turned patch lie up to so far outside of it.
 const MARGIN: i32 = 6;
 /// Side of the patches that the pattern is read from, pixels; their pairs do not touch.
 const TILE: i32 = 48;
@@ -101,7 +101,7 @@ impl SamplingPattern {
     /// Places of the turned pairs in an image, relative to the corner's.
     #[inline(always)]
     fn turned(&self, angle_rad: f32, width: usize) -> [i32; 2 * BITS] {
-        // Added to a number below it, it leaves the nearest whole number in the last bits, halves to the even one.
+        // A smaller number added to it is rounded to a whole one, halves to even, which the last bits hold.
         const WHOLE: f32 = 12_582_912.0;
         let ((sin, cos), width) = (angle_rad.sin_cos(), width as f32);
         let mut places = [0; 2 * BITS];

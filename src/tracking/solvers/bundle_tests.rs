@@ -110,7 +110,7 @@ fn a_bias_of_the_depth_is_found() {
     let mut unaware = problem.clone();
     problem.bias_prior = Some(BiasPrior { mean: DepthBias::default(), information: Vector3::repeat(1e-3) });
     problem.solve(&PINHOLE, 50, CONVERGED);
-    unaware.solve(&PINHOLE, 50);
+    unaware.solve(&PINHOLE, 50, CONVERGED);
     assert!((problem.depth_bias.0 - bias.0).norm() < 1e-5, "{:?}", problem.depth_bias);
     assert_eq!(unaware.depth_bias, DepthBias::default());
     let (error, without) = (worst_pose_error(&problem, &truth), worst_pose_error(&unaware, &truth));
@@ -132,7 +132,7 @@ fn the_offset_of_a_pairs_disparities_is_found_and_no_tilt() {
     let mut unaware = problem.clone();
     problem.bias_prior = Some(BiasPrior::of_pair(SCALE));
     problem.solve(&PINHOLE, 50, CONVERGED);
-    unaware.solve(&PINHOLE, 50);
+    unaware.solve(&PINHOLE, 50, CONVERGED);
     let found = problem.depth_bias.0;
     // The prior holds it back: these are a few dozen points.
     assert!(found.x > 0.3 * offset && found.x < offset && found.yz().norm() < 1e-2 * offset, "{found}");
