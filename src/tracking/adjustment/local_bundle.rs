@@ -21,7 +21,7 @@ use crate::tracking::solvers::residual::{InlierClass, Measurement};
 const MIN_SHARED: usize = 15;
 /// Keyframes that hold the window in place, at most; bounds the time.
 const MAX_FIXED: usize = 40;
-/// As [`CONVERGED`] for a window that landmarks alone hold: it gains little by more steps, and the next window goes on from there.
+/// As [`CONVERGED`], for a window without relative poses. More steps gain little there, and the next window goes on from the result.
 const CONVERGED_HELD: f64 = 3e-3;
 
 /// A frame between keyframes that holds landmarks as well.

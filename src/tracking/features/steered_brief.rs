@@ -19,7 +19,7 @@ use crate::tracking::features::orb::LevelImage;
 use crate::tracking::features::orientation::PATCH_RADIUS;
 use crate::tracking::features::quadtree::Corner;
 
-/// Pixels around a smoothed image. The corners of a turned patch lie up to so far outside of it.
+/// Pixels around a smoothed image: a turned patch at the border reaches so far outside.
 const MARGIN: i32 = 6;
 /// Side of the patches that the pattern is read from, pixels; their pairs do not touch.
 const TILE: i32 = 48;

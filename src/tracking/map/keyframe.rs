@@ -25,7 +25,7 @@ pub struct Keyframe {
     pub travelled: Travelled,
     /// Older keyframes that share most landmarks with it and how many, strongest first, as of its last bundle adjustment.
     pub links: Vec<(usize, usize)>,
-    /// Keyframes, older and newer, that share most landmarks with it, strongest first, as of then or of its beginning.
+    /// Keyframes that share most landmarks with it, older and newer ones, strongest first, as of its last bundle adjustment; before that, of its creation.
     pub neighbours: Vec<usize>,
     pub features: Arc<FrameFeatures>,
     /// Its pixels: where landmarks are few, and of the first in a submap, if there is depth.

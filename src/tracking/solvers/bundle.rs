@@ -14,7 +14,7 @@ use crate::tracking::solvers::schur::ReducedSystem;
 
 /// Damping that gives up: no step helps any more.
 const MAX_LAMBDA: f64 = 1e6;
-/// A step that lowers the cost by less than this share has converged, where nothing follows.
+/// A step that lowers the cost by less than this share has converged.
 pub const CONVERGED: f64 = 1e-4;
 
 /// One measurement of a point by a camera.
