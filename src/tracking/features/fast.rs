@@ -54,11 +54,12 @@ pub fn find_corners_with<'a, S: Simd>(
 ) {
     let Window { columns, rows } = window;
     let search = Search { image, columns, threshold };
-    // A column and a row of zeros on each side: every pixel has eight neighbours.
-    let row_bytes = (columns.len() + 2).next_multiple_of(8);
+    // A column and a row of zeros on each side: every pixel has eight neighbours. All vectors are whole.
+    let row_bytes = columns.len().next_multiple_of(LANES) + 2;
     let mut three = [vec![0; row_bytes], vec![0; row_bytes], vec![0; row_bytes]];
     for y in rows.start..=rows.end {
-        three.rotate_left(1);
+        three.swap(0, 1);
+        three.swap(1, 2);
         three[2].fill(0);
         if y < rows.end {
             search.score_row(y, &mut three[2][1..]);
@@ -158,13 +159,23 @@ fn best_arc(around: &[u8; 16], least: impl Fn(u8, u8) -> u8, best: impl Fn(u8, u
 #[inline(always)]
 fn add_maxima(three: &[Vec<u8>; 3], first_column: usize, y: usize, found: &mut Vec<Corner>) {
     let [above, row, below] = three;
-    let (words, _) = row.as_chunks::<8>();
-    for (word, eight) in words.iter().enumerate().filter(|(_, eight)| u64::from_ne_bytes(**eight) != 0) {
-        for (k, score) in (8 * word..).zip(eight).filter(|(_, score)| **score > 0) {
-            let highest = |scores: &[u8]| scores.iter().fold(0, |a, b| a.max(*b));
-            let around = highest(&above[k - 1..=k + 1]).max(highest(&below[k - 1..=k + 1])).max(row[k - 1]).max(row[k + 1]);
-            if around < *score {
-                found.push(Corner { x: (first_column + k - 1) as i32, y: y as i32, score: f32::from(*score - 1) });
+    for x in (0..row.len() - 2).step_by(LANES) {
+        let scores = lanes(row, x + 1);
+        if *scores == [0; LANES] {
+            continue;
+        }
+        let [a0, a1, a2] = [0, 1, 2].map(|k| lanes(above, x + k));
+        let [b0, b1, b2] = [0, 1, 2].map(|k| lanes(below, x + k));
+        let (before, after) = (lanes(row, x), lanes(row, x + 2));
+        let mut maxima = [0; LANES];
+        for l in 0..LANES {
+            let around = a0[l].max(a1[l]).max(a2[l]).max(b0[l]).max(b1[l]).max(b2[l]).max(before[l]).max(after[l]);
+            maxima[l] = if around < scores[l] { scores[l] } else { 0 };
+        }
+        let (words, _) = maxima.as_chunks::<8>();
+        for (word, eight) in words.iter().enumerate().filter(|(_, eight)| u64::from_ne_bytes(**eight) != 0) {
+            for (k, score) in (8 * word..).zip(eight).filter(|(_, score)| **score > 0) {
+                found.push(Corner { x: (first_column + x + k) as i32, y: y as i32, score: f32::from(*score - 1) });
             }
         }
     }

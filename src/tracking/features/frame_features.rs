@@ -99,10 +99,13 @@ impl FrameFeatures {
     pub fn within(&self, centre: &Vector2<f64>, radius: f64, octaves: &RangeInclusive<u8>, mut visit: impl FnMut(usize)) {
         let (x0, x1) = (cell(centre.x - radius, self.columns), cell(centre.x + radius, self.columns));
         let (y0, y1) = (cell(centre.y - radius, self.rows), cell(centre.y + radius, self.rows));
+        let (finest, coarsest) = (*octaves.start(), *octaves.end());
         for y in y0..=y1 {
             let span = self.cells[y * self.columns + x0] as usize..self.cells[y * self.columns + x1 + 1] as usize;
             for place in &self.by_cell[span] {
-                if octaves.contains(&place.octave) && (place.pixel - centre).norm_squared() <= radius * radius {
+                // One branch, which is seldom taken.
+                let of_octaves = (place.octave >= finest) & (place.octave <= coarsest);
+                if of_octaves & ((place.pixel - centre).norm_squared() <= radius * radius) {
                     visit(place.index as usize);
                 }
             }

@@ -12,6 +12,8 @@ struct Count {
 thread_local! {
     /// By id; all zero between two calls.
     static COUNTS: RefCell<Vec<Count>> = const { RefCell::new(Vec::new()) };
+    /// The number of the latest search for distinct ids, and by id that of the latest that met it.
+    static MET: RefCell<(u32, Vec<u32>)> = const { RefCell::new((0, Vec::new())) };
 }
 
 /// The ids and how often each comes, in the order in which they come first.
@@ -46,7 +48,22 @@ pub fn tally_votes(votes: impl Iterator<Item = (usize, u32)>) -> Vec<(usize, usi
 
 /// The ids, each once, in the order in which they come first.
 pub fn distinct(ids: impl Iterator<Item = usize>) -> Vec<usize> {
-    tally(ids).into_iter().map(|(id, _)| id).collect()
+    let (latest, mut met) = MET.take();
+    let this = latest.checked_add(1).unwrap_or_else(|| {
+        met.fill(0);
+        1
+    });
+    let mut found = Vec::new();
+    for id in ids {
+        if id >= met.len() {
+            met.resize((id + 1).next_power_of_two(), 0);
+        }
+        if std::mem::replace(&mut met[id], this) != this {
+            found.push(id);
+        }
+    }
+    MET.set((this, met));
+    found
 }
 
 #[cfg(test)]
@@ -59,6 +76,17 @@ mod tests {
         let nested = tally([1, 3].into_iter().flat_map(|k| distinct([k, 5, k].into_iter())));
         assert_eq!(nested, [(1, 1), (5, 2), (3, 1)]);
         assert!(distinct(std::iter::empty()).is_empty());
+        let nested = distinct([1, 3].into_iter().flat_map(|k| distinct([k, 5, k, 1].into_iter())));
+        assert_eq!(nested, [1, 5, 3]);
+    }
+
+    #[test]
+    fn searches_begin_to_count_anew_when_their_numbers_end() {
+        assert_eq!(distinct([1, 2, 1].into_iter()), [1, 2]);
+        MET.with_borrow_mut(|(latest, _)| *latest = u32::MAX - 1);
+        for _ in 0..3 {
+            assert_eq!(distinct([2, 1, 1, 4].into_iter()), [2, 1, 4]);
+        }
     }
 
     #[test]
