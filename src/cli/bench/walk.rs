@@ -48,6 +48,9 @@ struct Part {
     longest_stage: &'static str,
     /// The most that the tracking thread computed for a frame: without waiting, whatever else the machine does.
     longest_own_ms: f64,
+    /// At its end, of all frames until then.
+    loops: usize,
+    ate_rmse_m: Option<f64>,
     keyframes: usize,
     living: usize,
     /// Of this process, bytes; 0 where the system does not say.
@@ -68,8 +71,9 @@ pub(super) fn walk(args: &WalkArgs, verbosity: Verbosity) -> miette::Result<()> 
         "| seed | frames | lost | keyframes | living | loops | wrong | ATE RMSE, cm | ms a frame | longest | own | memory, MB |\n\
          |---|---|---|---|---|---|---|---|---|---|---|---|\n",
     );
-    let mut csv =
-        String::from("seed,frame,lost,keyframes,living,ms_per_frame,longest_ms,longest_stage,longest_own_ms,memory_bytes\n");
+    let mut csv = String::from(
+        "seed,frame,lost,keyframes,living,loops,ate_rmse_cm,ms_per_frame,longest_ms,longest_stage,longest_own_ms,memory_bytes\n",
+    );
     for seed in 0..args.seeds {
         let outcome = replay(args, seed, &bar)?;
         let Outcome { parts, loops, wrong_loops, ate_rmse_m } = &outcome;
@@ -77,14 +81,15 @@ pub(super) fn walk(args: &WalkArgs, verbosity: Verbosity) -> miette::Result<()> 
         for part in parts {
             frame += part.frames;
             let ms = part.total_ms / part.frames.max(1) as f64;
-            let Part { lost, keyframes, living, longest_ms, longest_stage, longest_own_ms: own, memory, .. } = part;
+            let Part { lost, keyframes, living, loops, longest_ms, longest_stage, longest_own_ms: own, memory, .. } = part;
+            let ate = centimetres(part.ate_rmse_m);
             csv += &format!(
-                "{seed},{frame},{lost},{keyframes},{living},{ms:.3},{longest_ms:.2},{longest_stage},{own:.2},{memory}\n"
+                "{seed},{frame},{lost},{keyframes},{living},{loops},{ate},{ms:.3},{longest_ms:.2},{longest_stage},{own:.2},{memory}\n"
             );
             if args.seeds == 1 {
                 let megabytes = memory >> 20;
                 table += &format!(
-                    "| | {frame} | {lost} | {keyframes} | {living} | | | | {ms:.2} | {longest_ms:.1} ({longest_stage}) | {own:.1} | {megabytes} |\n"
+                    "| | {frame} | {lost} | {keyframes} | {living} | {loops} | | {ate} | {ms:.2} | {longest_ms:.1} ({longest_stage}) | {own:.1} | {megabytes} |\n"
                 );
             }
         }
@@ -93,7 +98,7 @@ pub(super) fn walk(args: &WalkArgs, verbosity: Verbosity) -> miette::Result<()> 
         let ms = parts.iter().map(|p| p.total_ms).sum::<f64>() / frame.max(1) as f64;
         let longest = parts.iter().map(|p| p.longest_ms).fold(0.0, f64::max);
         let own = parts.iter().map(|p| p.longest_own_ms).fold(0.0, f64::max);
-        let ate = ate_rmse_m.map_or_else(|| "–".into(), |metres| format!("{:.2}", 100.0 * metres));
+        let ate = centimetres(*ate_rmse_m);
         let (keyframes, living, memory) = last;
         table += &format!(
             "| {seed} | {frame} | {lost} | {keyframes} | {living} | {loops} | {wrong_loops} | {ate} | {ms:.2} | {longest:.1} | {own:.1} | {memory} |\n"
@@ -128,16 +133,28 @@ fn replay(args: &WalkArgs, seed: u64, bar: &indicatif::ProgressBar) -> miette::R
             (part.longest_ms, part.longest_stage) = (ms, longest_stage(&tracked.times));
         }
         (part.keyframes, part.living) = (tracker.keyframe_count(), tracker.living_keyframes());
-        if i % 100 == 0 || (i + 1) * PARTS / frames != i * PARTS / frames {
+        let ends_part = (i + 1) * PARTS / frames != i * PARTS / frames;
+        if i % 100 == 0 || ends_part {
             part.memory = memory();
             bar.set_position(seed * frames as u64 + i as u64);
+        }
+        if ends_part {
+            (part.loops, part.ate_rmse_m) = (tracker.loops().len(), ate_rmse_m(&tracker, &truth));
         }
     }
     tracker.finish().into_diagnostic()?;
     let (loops, wrong_loops) = (tracker.loops().len(), args.world.wrong_loops(&tracker, &truth));
+    Ok(Outcome { parts, loops, wrong_loops, ate_rmse_m: ate_rmse_m(&tracker, &truth) })
+}
+
+fn ate_rmse_m(tracker: &Tracker, truth: &Trajectory) -> Option<f64> {
     let poses = tracker.trajectory().into_iter().map(|(_, pose)| pose).collect();
-    let errors = evaluate_trajectory(&truth, &Trajectory { poses }, Alignment::Rigid);
-    Ok(Outcome { parts, loops, wrong_loops, ate_rmse_m: errors.ok().map(|e| e.ate_rmse_m) })
+    let errors = evaluate_trajectory(truth, &Trajectory { poses }, Alignment::Rigid);
+    errors.ok().map(|errors| errors.ate_rmse_m)
+}
+
+fn centimetres(metres: Option<f64>) -> String {
+    metres.map_or_else(|| "–".into(), |metres| format!("{:.2}", 100.0 * metres))
 }
 
 fn longest_stage(times: &StageTimes) -> &'static str {
