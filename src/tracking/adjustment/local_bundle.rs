@@ -165,7 +165,7 @@ impl Adjustment {
     }
 
     /// Takes the result into the map; returns the keyframes that may have moved, in ascending order. Those that came since go
-    /// rigidly with the one that they share most with, as do those that were left out. What hangs on a keyframe goes with it.
+    /// rigidly with the older one that they share most with, as do those that were left out. What hangs on a keyframe goes with it.
     pub fn apply(&self, map: &mut Map, config: &TrackingConfig) -> Vec<usize> {
         let free = &self.keyframes[..self.free_keyframes];
         let mut before: BTreeMap<usize, Se3> = BTreeMap::new();
@@ -177,11 +177,12 @@ impl Adjustment {
             map.set_pose(*k, *pose);
         }
         for other in self.carried.iter().copied().chain(self.known..map.keyframes.len()) {
-            let covisible = map.covisible(other).into_iter().map(|(k, _)| k).find(|k| before.contains_key(k));
+            let covisible = map.covisible(other).into_iter().map(|(k, _)| k).find(|k| *k < other || before.contains_key(k));
             // Pixels tie a keyframe that shares no landmarks to the one before it.
-            let preceding = || before.range(..other).next_back().map(|(k, _)| *k);
-            let in_submap = |k: &usize| map.keyframes[*k].root == map.keyframes[other].root;
-            let Some(neighbour) = covisible.or_else(preceding).filter(in_submap) else { continue };
+            let preceding = || map.living.range(..other).next_back().copied();
+            // With one that stays, it stays: what the window has moved may be far away.
+            let has_moved = |k: &usize| before.contains_key(k) && map.keyframes[*k].root == map.keyframes[other].root;
+            let Some(neighbour) = covisible.or_else(preceding).filter(has_moved) else { continue };
             let pose = map.keyframes[other].camera_from_world;
             let other_from_neighbour = pose * before[&neighbour].inverse();
             before.insert(other, pose);
@@ -309,6 +310,27 @@ mod tests {
         assert!(se3::log(&(map.keyframes[newer].camera_from_world * (pose * push).inverse())).norm() < 1e-12);
         assert!((map.position(own) - push.inverse() * Point3::new(1.0, 2.0, 3.0)).norm() < 1e-12);
         assert!(map.landmarks[gone].state == LandmarkState::Removed && map.landmarks[gone].observations.is_empty());
+    }
+
+    #[test]
+    fn a_keyframe_that_came_since_stays_with_one_that_stays() {
+        let config = TrackingConfig { window_keyframes: 2, ..Default::default() };
+        let mut map = drifted(&Sim3::identity(), true, &config);
+        let mut window = Adjustment::of_window(&map, 1, &Rig::new(PINHOLE, config.clone())).unwrap();
+        // It shares landmarks with the last keyframe, which the window has not moved, or with none.
+        let last = map.keyframes.len() - 1;
+        let newer = [true, false].map(|shares| {
+            let newer =
+                map.push(Keyframe { landmarks: vec![None; map.keyframes[last].landmarks.len()], ..map.keyframes[last].clone() });
+            for (feature, landmark) in map.keyframes[last].landmarks.clone().into_iter().enumerate().filter(|_| shares) {
+                landmark.into_iter().for_each(|l| map.add_observation(l, Observation { keyframe: newer, feature }));
+            }
+            newer
+        });
+        let push = Se3::translation(0.1, 0.0, 0.0);
+        window.problem.poses.iter_mut().for_each(|p| *p *= push);
+        let moved = window.apply(&mut map, &config);
+        assert!(moved.contains(&1) && !moved.contains(&last) && newer.iter().all(|k| !moved.contains(k)), "{moved:?}");
     }
 
     #[test]

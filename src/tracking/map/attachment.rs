@@ -41,8 +41,9 @@ impl Map {
         }
     }
 
-    /// Gives up a keyframe, which has no landmarks any more: it and what it carries is attached to another one.
-    pub fn attach(&mut self, keyframe: usize, parent: usize) {
+    /// Gives up a keyframe, which has no landmarks any more: it is attached to the first of some others, and what it carries to the nearest of them. A
+    /// parent far away would swing what it carries with each of its turns.
+    pub fn attach(&mut self, keyframe: usize, parents: &[usize]) {
         let nothing = self.no_features.clone();
         let given_up = &mut self.keyframes[keyframe];
         let features = std::mem::replace(&mut given_up.features, nothing);
@@ -54,7 +55,11 @@ impl Map {
         self.features -= features.len();
         let moved: Vec<usize> = self.with_carried(keyframe).collect();
         self.carried.remove(&keyframe);
-        for keyframe in moved {
+        for (k, keyframe) in moved.into_iter().enumerate() {
+            let centre = self.keyframes[keyframe].centre();
+            let distance = |parent: &usize| (self.keyframes[*parent].centre() - centre).norm_squared();
+            let nearest = || parents.iter().min_by(|a, b| distance(a).total_cmp(&distance(b)));
+            let Some(parent) = (if k == 0 { parents.first() } else { nearest() }).copied() else { return };
             let camera_from_parent = self.keyframes[parent].relative(&self.keyframes[keyframe].camera_from_world);
             self.keyframes[keyframe].parent = Some(parent);
             self.carried.entry(parent).or_default().push(CulledKeyframe { keyframe, camera_from_parent });
@@ -78,7 +83,7 @@ mod tests {
         map.add_observation(id, at(2, 4));
         map.keyframes[1].unit = 2.0;
         map.set_position(id, &Point3::new(0.5, 0.0, 2.0));
-        map.attach(0, 1);
+        map.attach(0, &[1]);
         let push = Se3::translation(0.0, 0.3, 0.0);
         map.set_pose(1, push);
         assert!((map.position(id) - Point3::new(0.5, -0.3, 2.0)).norm() < 1e-12);
@@ -90,10 +95,20 @@ mod tests {
     }
 
     #[test]
+    fn what_a_culled_keyframe_carried_goes_with_the_nearest() {
+        let mut map = map();
+        let near = map.push(map.keyframes[2].clone());
+        map.set_pose(2, Se3::translation(0.0, 0.0, 5.0));
+        map.attach(0, &[1]);
+        map.attach(1, &[2, near]);
+        assert_eq!((map.living(1), map.living(0)), (2, near));
+    }
+
+    #[test]
     fn a_culled_keyframe_keeps_no_memory_of_what_it_saw() {
         let mut map = map();
-        map.attach(0, 1);
-        map.attach(1, 2);
+        map.attach(0, &[1]);
+        map.attach(1, &[2]);
         for culled in &map.keyframes[..2] {
             assert_eq!((culled.landmarks.capacity(), culled.links.capacity(), culled.parent), (0, 0, Some(2)));
             assert!(Arc::ptr_eq(&culled.features, &map.no_features));

@@ -27,7 +27,7 @@ pub fn cull_around(map: &mut Map, around: usize, keep: impl Fn(usize) -> bool, c
             && keyframe < oldest_kept
             && !keep(keyframe)
             && is_redundant(map, keyframe)
-            && cull(map, keyframe, config)
+            && cull(map, keyframe, &[], config)
         {
             culled.push(keyframe);
         }
@@ -75,23 +75,31 @@ pub fn thin(map: &mut Map, bytes: u64, from: usize, keep: impl Fn(usize) -> bool
     let shares: Vec<(usize, f64)> = examined.iter().map(|k| (*k, seen_elsewhere(k))).collect();
     let most = shares.iter().max_by(|a, b| a.1.total_cmp(&b.1).then(b.0.cmp(&a.0)));
     if let Some((keyframe, _)) = most {
-        cull(map, *keyframe, config);
+        // Where keyframes are sparse, the nearest may share nothing with it. There are only so many.
+        let living: Vec<usize> = map.living_in(map.keyframes[*keyframe].root).filter(|k| k != keyframe).collect();
+        cull(map, *keyframe, &living, config);
     }
     examined.last().copied().unwrap_or(0)
 }
 
-/// Culls a keyframe; `false` if no other could be its parent. Pixels tie one that shares no landmarks to the one before it.
-fn cull(map: &mut Map, keyframe: usize, config: &TrackingConfig) -> bool {
-    let covisible = map.covisible(keyframe).first().map(|(other, _)| *other);
-    let root = map.keyframes[keyframe].root;
-    let preceding = || map.living.range(..keyframe).next_back().copied().filter(|other| map.keyframes[*other].root == root);
-    let Some(parent) = covisible.or_else(preceding) else { return false };
+/// Culls a keyframe; `false` if no other could be its parent. Pixels tie one that shares no landmarks to the one before it. `others` may be parents of
+/// what it carries, too.
+fn cull(map: &mut Map, keyframe: usize, others: &[usize], config: &TrackingConfig) -> bool {
+    let mut parents: Vec<usize> = map.covisible(keyframe).into_iter().map(|(other, _)| other).collect();
+    if parents.is_empty() {
+        let root = map.keyframes[keyframe].root;
+        parents.extend(map.living.range(..keyframe).next_back().filter(|other| map.keyframes[**other].root == root));
+    }
+    if parents.is_empty() {
+        return false;
+    }
+    parents.extend_from_slice(others);
     for (feature, landmark) in map.keyframes[keyframe].landmarks.clone().into_iter().enumerate() {
         let Some(landmark) = landmark else { continue };
         map.remove_observation(landmark, Observation { keyframe, feature });
         map.refresh_geometry(landmark, config);
     }
-    map.attach(keyframe, parent);
+    map.attach(keyframe, &parents);
     true
 }
 
