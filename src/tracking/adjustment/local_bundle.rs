@@ -227,16 +227,15 @@ fn choose_window(map: &Map, keyframe: usize, config: &TrackingConfig) -> (Vec<us
     let mut free = distinct(std::iter::once(keyframe).chain(references(&keyframe)).chain(neighbours));
     free.truncate(config.window_keyframes);
     free.retain(|k| !map.is_root(*k));
-    let landmarks = map.landmarks_of(&free);
-    let covisible = map.covisibility(landmarks.into_iter()).into_iter().map(|(k, _)| k);
-    let mut fixed = distinct(free.iter().flat_map(references).chain(covisible).filter(|k| !free.contains(k)));
+    let mut others = map.covisibility(map.landmarks_of(&free).into_iter());
+    others.retain(|(k, _)| !free.contains(k));
+    let mut fixed = distinct(free.iter().flat_map(references).filter(|k| !free.contains(k)));
+    // By a few landmarks, some of them false, the window would be torn from its place: its oldest keyframe holds it.
+    let holds = !fixed.is_empty() || others.first().is_some_and(|(_, shared)| *shared >= MIN_SHARED);
+    let oldest = free.iter().copied().min().filter(|_| !holds);
+    free.retain(|k| Some(*k) != oldest);
+    fixed = distinct(oldest.into_iter().chain(fixed).chain(others.into_iter().map(|(k, _)| k)));
     fixed.truncate(MAX_FIXED);
-    if fixed.is_empty()
-        && let Some(oldest) = free.iter().copied().min()
-    {
-        free.retain(|k| *k != oldest);
-        fixed.push(oldest);
-    }
     (free, fixed)
 }
 
