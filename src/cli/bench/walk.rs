@@ -48,8 +48,9 @@ struct Part {
     longest_stage: &'static str,
     /// The most that the tracking thread computed for a frame: without waiting, whatever else the machine does.
     longest_own_ms: f64,
-    /// At its end, of all frames until then.
+    /// Closed until its end.
     loops: usize,
+    /// Of all frames until its end.
     ate_rmse_m: Option<f64>,
     keyframes: usize,
     living: usize,

@@ -41,8 +41,8 @@ impl Map {
         }
     }
 
-    /// Gives up a keyframe, which has no landmarks any more: it is attached to the first of some others, and what it carries to the nearest of them. A
-    /// parent far away would swing what it carries with each of its turns.
+    /// Gives up a keyframe, which has no landmarks any more. It is attached to the first of `parents`, of which there is at least one; what it carries,
+    /// to the nearest: each turn of a parent far away would move it far.
     pub fn attach(&mut self, keyframe: usize, parents: &[usize]) {
         let nothing = self.no_features.clone();
         let given_up = &mut self.keyframes[keyframe];

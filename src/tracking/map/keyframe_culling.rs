@@ -75,7 +75,7 @@ pub fn thin(map: &mut Map, bytes: u64, from: usize, keep: impl Fn(usize) -> bool
     let shares: Vec<(usize, f64)> = examined.iter().map(|k| (*k, seen_elsewhere(k))).collect();
     let most = shares.iter().max_by(|a, b| a.1.total_cmp(&b.1).then(b.0.cmp(&a.0)));
     if let Some((keyframe, _)) = most {
-        // Where keyframes are sparse, the nearest may share nothing with it. There are only so many.
+        // Where keyframes are sparse, the nearest may share nothing with it. The map's bytes bound their number.
         let living: Vec<usize> = map.living_in(map.keyframes[*keyframe].root).filter(|k| k != keyframe).collect();
         cull(map, *keyframe, &living, config);
     }
