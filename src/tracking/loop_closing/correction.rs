@@ -46,7 +46,8 @@ pub struct Correction {
 }
 
 impl Correction {
-    /// Spreads the drift that a loop shows over its submap; `edges` are those of all loops, this one's the last.
+    /// Spreads the drift that a loop shows over its submap; `edges` are those of all loops, this one's the last. The earlier ones hold their keyframes
+    /// as they are.
     pub fn of_loop(map: &Map, found: Recognised, edges: &[Edge], scale_is_free: bool) -> Self {
         let keyframes: Vec<usize> = map.living_in(map.keyframes[found.keyframe].root).collect();
         let before: Vec<Se3> = keyframes.iter().map(|k| map.keyframes[*k].camera_from_world).collect();
@@ -66,8 +67,13 @@ impl Correction {
                 graph.edges.push(edge(a, b, Sim3::from(before[a] * before[b].inverse()), shared, depth));
             }
         }
-        // Edges of other submaps have no place.
-        graph.edges.extend(edges.iter().filter_map(|e| Some(Edge { a: place(e.a)?, b: place(e.b)?, ..*e })));
+        // Edges of other submaps have no place. What earlier loops measured, bundle adjustment has improved since: they keep what it found.
+        for (k, edge) in edges.iter().enumerate() {
+            let Some((a, b)) = place(edge.a).zip(place(edge.b)) else { continue };
+            let is_new = k + 1 == edges.len();
+            let a_from_b = if is_new { edge.a_from_b } else { Sim3::from(before[a] * before[b].inverse()) };
+            graph.edges.push(Edge { a, b, a_from_b, ..*edge });
+        }
         Self { found, keyframes, before, graph, known: map.keyframes.len() }
     }
 

@@ -15,6 +15,7 @@ use crate::tracking::localisation::dense_alignment::tests::corner;
 use crate::tracking::loop_closing::{LoopCloser, MovedKeyframe};
 use crate::tracking::map::sparse_map::{Keyframe, Map, Observation};
 use crate::tracking::rig::Rig;
+use crate::tracking::solvers::pose_graph::Edge;
 use crate::tracking::solvers::residual::tests::PINHOLE;
 
 const STATIONS: usize = 48;
@@ -159,6 +160,23 @@ fn submaps_that_show_one_place_become_one() {
         assert!(off < 0.02, "{off} m");
         assert!(map.covisible(newest).iter().any(|(k, shared)| *k < first && *shared > 50));
     }
+}
+
+#[test]
+fn an_earlier_loop_holds_its_keyframes_as_bundle_adjustment_has_left_them() {
+    let config = TrackingConfig::default();
+    let mut map = drifted(&Sim3::identity(), true, &config);
+    let (newest, rig) = (map.keyframes.len() - 1, Rig::new(PINHOLE, config));
+    let mut closer = LoopCloser::default();
+    let (a, b) = (STATIONS / 2, STATIONS / 4);
+    let measured = se3::exp(&Vector6::new(0.2, 0.0, -0.1, 0.0, 0.02, 0.0)) * station(a) * station(b).inverse();
+    let weights = Vector7::repeat(1e3);
+    closer.edges.push(Edge { a, b, a_from_b: Sim3::from(measured), weights, huber: None });
+    let mut correction = closer.recognise(&mut map, newest, &rig).unwrap();
+    correction.solve();
+    assert!(!closer.apply(&correction, &mut map, &rig).is_empty());
+    let off = off_metres(&map, false);
+    assert!(off < 5e-3, "{off} m");
 }
 
 #[test]
