@@ -97,6 +97,7 @@ impl Tracker {
     /// Those of [`Self::finish`].
     pub fn break_off(&mut self) -> Result<Vec<KeyframeUpdate>, TrackingError> {
         self.take_in_all()?;
+        self.settle_all_frames();
         Ok(self.updates())
     }
 

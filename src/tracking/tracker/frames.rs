@@ -1,31 +1,28 @@
 //! Frames between keyframes: which of them become image-only keyframes, and their poses once the landmarks that they saw have settled.
 //!
 //! The tracker carries a frame by its reference keyframe. Bundle adjustment moves keyframe and landmarks in different ways; the pose is therefore
-//! solved once more when it is over with both. With measured depth, their observations are kept as far as memory allows: the
-//! adjustment at the end includes them, and the poses are solved again after it.
+//! solved once more when it is over with both: at once for image-only keyframes and without measured depth, else when memory is short or at the end.
+//! With measured depth, observations are kept as far as memory allows: the adjustment at the end includes them, and the poses are solved after it.
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use nalgebra::Vector2;
 use rayon::prelude::*;
 
+use super::sightings::Sightings;
 use super::{Tracker, keyframe_selection};
 use crate::geometry::Se3;
 use crate::sequence::Sensor;
 use crate::tracking::adjustment::local_bundle::FrameView;
-use crate::tracking::features::frame_features::FrameFeatures;
 use crate::tracking::map::sparse_map::{Keyframe, Map, SETTLED_AFTER};
 use crate::tracking::rig::Rig;
-use crate::tracking::solvers::pose::{PoseObservation, PosePrior, optimise_pose};
-use crate::tracking::solvers::relative_pose::RelativePose;
-use crate::tracking::solvers::residual::Measurement;
+use crate::tracking::solvers::pose::optimise_pose;
 use crate::tracking::{KeyframePose, NewKeyframe};
 
 /// At each frame so many are, so that none takes long.
 const SETTLED_A_FRAME: usize = 2;
 /// Frames that may wait for it: a camera that stands still makes no keyframes.
 const MOST_WAITING: usize = 256;
-/// What settled frames saw takes at most this share of the tracker's host memory.
+/// What frames saw takes at most this share of the tracker's host memory: half of it settled frames, half those that wait for it.
 const SHARE_OF_HOST_BYTES: u64 = 8;
 /// Share of the landmarks that must still be there, and agree.
 const LEAST_AGREEING: f64 = 0.5;
@@ -42,30 +39,12 @@ pub(super) struct Record {
     pub sightings: Sightings,
 }
 
-/// Landmarks that a frame saw.
-#[derive(Clone, Debug, Default)]
-pub(super) struct Sightings {
-    seen: Vec<Sighting>,
-    /// How many keyframes there were: later landmarks may have taken the places of these.
-    known: usize,
-    /// The frame's pose relative to a keyframe by all pixels, where landmarks were few.
-    relative_pose: Option<Box<RelativePose>>,
-}
-
-/// A landmark where a frame saw it.
-#[derive(Clone, Copy, Debug)]
-struct Sighting {
-    landmark: u32,
-    pixel: [f32; 2],
-    /// 1/metres; NaN without depth.
-    inverse_depth: f32,
-    /// Inverse standard deviations of pixel and inverse depth.
-    weights: [f32; 2],
-}
-
 /// What is kept of frames between keyframes.
 #[derive(Debug, Default)]
 pub(super) struct Frames {
+    /// Bundle adjustment is over with the landmarks of records before this one, and their bytes as far as they are not settled.
+    aged: usize,
+    waiting_bytes: usize,
     /// Records before this one have been solved again.
     settled: usize,
     /// How often the sightings that these keep were halved in number, and their bytes.
@@ -77,66 +56,6 @@ pub(super) struct Frames {
     images: BTreeMap<usize, Vec<usize>>,
     /// Those whose poses were solved again since the last update.
     moved: BTreeSet<usize>,
-}
-
-impl Sightings {
-    pub fn new(features: &FrameFeatures, landmarks: &[Option<usize>], map: &Map, rig: &Rig) -> Self {
-        // No larger than needed: they stay for as long as the recording lasts.
-        let mut seen = Vec::with_capacity(landmarks.iter().flatten().count());
-        seen.extend(features.features.iter().zip(landmarks).filter_map(|(feature, landmark)| {
-            let measured = rig.biased_measurement(feature);
-            Some(Sighting {
-                landmark: u32::try_from((*landmark)?).ok()?,
-                pixel: [measured.pixel.x as f32, measured.pixel.y as f32],
-                inverse_depth: measured.inverse_depth.map_or(f32::NAN, |inverse| inverse as f32),
-                weights: [measured.pixel_weight as f32, measured.depth_weight as f32],
-            })
-        }));
-        Self { seen, known: map.keyframes.len(), relative_pose: None }
-    }
-
-    pub fn with_relative_pose(self, relative_pose: Option<RelativePose>) -> Self {
-        Self { relative_pose: relative_pose.map(Box::new), ..self }
-    }
-
-    fn bytes(&self) -> usize {
-        self.seen.len() * size_of::<Sighting>() + self.relative_pose.as_deref().map_or(0, size_of_val)
-    }
-
-    /// Landmarks that are still there, and where they were measured.
-    fn measured(&self, map: &Map) -> Vec<(usize, Measurement)> {
-        let measured = |s: &Sighting| {
-            let landmark = map.resolve_since(s.landmark as usize, self.known)?;
-            let measurement = Measurement {
-                pixel: Vector2::from(s.pixel.map(f64::from)),
-                inverse_depth: (!s.inverse_depth.is_nan()).then_some(s.inverse_depth.into()),
-                pixel_weight: s.weights[0].into(),
-                depth_weight: s.weights[1].into(),
-            };
-            Some((landmark, measurement))
-        };
-        self.seen.iter().filter_map(measured).collect()
-    }
-
-    /// The relative pose, unless its keyframe was culled.
-    fn living_relative_pose(&self, map: &Map) -> Option<&RelativePose> {
-        self.relative_pose.as_deref().filter(|relative| map.living.contains(&relative.reference))
-    }
-
-    /// What it says of the frame's pose.
-    fn prior(&self, map: &Map) -> Option<PosePrior> {
-        let relative = self.living_relative_pose(map)?;
-        Some(relative.prior(&map.keyframes[relative.reference].camera_from_world))
-    }
-
-    /// The same with their places, freed of the depth's bias.
-    fn observations(&self, map: &Map, rig: &Rig) -> Vec<PoseObservation> {
-        let observation = |(landmark, measured): (usize, Measurement)| {
-            let measurement = measured.without_bias(&rig.pinhole, &rig.depth_bias);
-            PoseObservation { point_in_world: map.position(landmark), measurement }
-        };
-        self.measured(map).into_iter().map(observation).collect()
-    }
 }
 
 impl Record {
@@ -202,12 +121,22 @@ impl Tracker {
         Some(NewKeyframe { id: frame_index, world_from_camera, seen: Vec::new(), covisible: Vec::new(), image_only: true })
     }
 
-    /// Solves the poses of frames whose landmarks bundle adjustment has left behind, a few at a time.
+    /// Solves the poses of frames whose landmarks bundle adjustment has left behind and that cannot wait for the end, a few at a time.
     pub(super) fn settle_old_frames(&mut self) {
         let end = self.map.keyframes.len().saturating_sub(SETTLED_AFTER);
+        let may_wait = self.adjusts_frames();
         for _ in 0..SETTLED_A_FRAME {
-            let is_old = self.records.get(self.frames.settled).is_some_and(|record| record.reference < end);
-            if is_old || self.records.len() > self.frames.settled + MOST_WAITING {
+            let aged = self.frames.aged;
+            let is_old = self.records.get(aged).is_some_and(|record| record.reference < end);
+            if is_old || self.records.len() > aged + MOST_WAITING {
+                self.frames.waiting_bytes += self.records[aged].sightings.bytes();
+                if may_wait && self.is_image_only(aged) && self.records[aged].settle(&self.map, &self.rig) {
+                    self.frames.moved.insert(aged);
+                }
+                self.frames.aged += 1;
+            }
+            let cannot_wait = !may_wait || self.frames.waiting_bytes > self.most_frame_bytes();
+            if cannot_wait && self.frames.settled < self.frames.aged {
                 let moved = self.records[self.frames.settled].settle(&self.map, &self.rig);
                 self.note_settled(moved);
             }
@@ -219,6 +148,9 @@ impl Tracker {
         let (map, rig) = (&self.map, &self.rig);
         let left = self.records[self.frames.settled..].par_iter_mut();
         let moved: Vec<bool> = left.map(|record| record.settle(map, rig)).collect();
+        self.frames.waiting_bytes +=
+            self.records[self.frames.aged..].iter().map(|record| record.sightings.bytes()).sum::<usize>();
+        self.frames.aged = self.records.len();
         moved.into_iter().for_each(|moved| self.note_settled(moved));
     }
 
@@ -228,7 +160,8 @@ impl Tracker {
             return Vec::new();
         }
         let of_submap = |record: &&Record| self.map.keyframes[record.reference].root == root && !record.sightings.seen.is_empty();
-        let records: Vec<&Record> = self.records.iter().filter(of_submap).collect();
+        // Those that wait are no denser than those that are settled.
+        let records: Vec<&Record> = self.records.iter().step_by(1 << self.frames.halvings).filter(of_submap).collect();
         let observations: usize = records.iter().map(|record| record.sightings.seen.len()).sum();
         let every = observations.div_ceil(most_observations.max(1)).max(1);
         let view = |record: &&Record| FrameView {
@@ -246,19 +179,31 @@ impl Tracker {
 
     /// Lets all frames that kept their sightings be solved once more.
     pub(super) fn unsettle_frames(&mut self) {
-        (self.frames.settled, self.frames.kept_bytes) = (0, 0);
+        let frames = &mut self.frames;
+        frames.waiting_bytes += std::mem::take(&mut frames.kept_bytes);
+        frames.settled = 0;
     }
 
-    /// Memory of what settled frames saw, bytes.
+    /// Memory of what frames saw, bytes.
     pub(super) fn frame_bytes(&self) -> u64 {
-        self.frames.kept_bytes as u64
+        (self.frames.waiting_bytes + self.frames.kept_bytes) as u64
+    }
+
+    /// Bytes that settled frames may keep, and as many that frames may wait with.
+    fn most_frame_bytes(&self) -> usize {
+        (self.rig.config.max_host_bytes / SHARE_OF_HOST_BYTES / 2) as usize
+    }
+
+    /// Whether a record is that of an image-only keyframe.
+    fn is_image_only(&self, record: usize) -> bool {
+        self.frames.images_of(self.records[record].reference).binary_search(&record).is_ok()
     }
 
     /// A settled record keeps its sightings, or gives them up; where all together are too many, every other record does.
     fn keep_or_drop_sightings(&mut self, settled: usize) {
-        let most = (self.rig.config.max_host_bytes / SHARE_OF_HOST_BYTES) as usize;
-        let kept = self.adjusts_frames();
+        let (most, kept) = (self.most_frame_bytes(), self.adjusts_frames());
         let frames = &mut self.frames;
+        frames.waiting_bytes -= self.records[settled].sightings.bytes();
         if !(kept && settled.is_multiple_of(1 << frames.halvings)) {
             self.records[settled].sightings = Sightings::default();
         }
@@ -275,8 +220,7 @@ impl Tracker {
     /// Notes that the next frame has been solved, and whether its pose is another.
     fn note_settled(&mut self, moved: bool) {
         let settled = self.frames.settled;
-        let record = &self.records[settled];
-        if moved && self.frames.images_of(record.reference).binary_search(&settled).is_ok() {
+        if moved && self.is_image_only(settled) {
             self.frames.moved.insert(settled);
         }
         self.keep_or_drop_sightings(settled);
@@ -302,6 +246,7 @@ impl Tracker {
 mod tests {
     use super::*;
     use crate::geometry::{Sim3, se3};
+    use crate::tracking::solvers::relative_pose::RelativePose;
     use crate::tracking::tracker::adjusting::tests::tracker;
     use nalgebra::{Matrix6, Vector6};
 
@@ -351,7 +296,45 @@ mod tests {
             tracker.records.push(Record { frame_index, timestamp_s: 0.1, reference: newest, camera_from_reference, sightings });
             tracker.settle_old_frames();
         }
-        assert_eq!(tracker.records.len() - tracker.frames.settled, MOST_WAITING);
+        assert_eq!(tracker.records.len() - tracker.frames.aged, MOST_WAITING);
+    }
+
+    #[test]
+    fn frames_wait_for_the_end_unless_memory_is_short_or_the_mapper_has_them() {
+        const IMAGE: usize = 5;
+        let solved = |sensor, max_host_bytes| {
+            let mut tracker = tracker(sensor, &Sim3::identity());
+            tracker.rig.config.max_host_bytes = max_host_bytes;
+            let Keyframe { features, landmarks, camera_from_world, .. } = tracker.map.keyframes[2].clone();
+            let off = Se3::translation(0.01, 0.0, -0.01) * camera_from_world;
+            let (camera_from_reference, sightings) =
+                (tracker.map.keyframes[1].relative(&off), Sightings::new(&features, &landmarks, &tracker.map, &tracker.rig));
+            let record = |k: usize| Record {
+                frame_index: 1000 + k,
+                timestamp_s: 0.1,
+                reference: 1,
+                camera_from_reference,
+                sightings: sightings.clone(),
+            };
+            tracker.records = (0..20).map(record).collect();
+            tracker.frames.images.insert(1, vec![IMAGE]);
+            (0..20).for_each(|_| tracker.settle_old_frames());
+            assert_eq!(tracker.frames.aged, 20);
+            let is_solved = |tracker: &Tracker| {
+                let poses = tracker.records.iter().map(|r| (r.pose(&tracker.map) * camera_from_world.inverse()).translation);
+                poses.map(|off| off.vector.norm() < 0.002).collect::<Vec<bool>>()
+            };
+            let before = is_solved(&tracker);
+            tracker.settle_all_frames();
+            assert!(is_solved(&tracker).iter().all(|solved| *solved));
+            assert!(tracker.frames.take_moved().contains(&IMAGE));
+            let count = before.iter().filter(|solved| **solved).count();
+            assert!(before[IMAGE]);
+            count
+        };
+        assert_eq!(solved(Sensor::Rgbd, u64::MAX), 1);
+        assert_eq!(solved(Sensor::Rgbd, 0), 20);
+        assert_eq!(solved(Sensor::Mono, u64::MAX), 20);
     }
 
     #[test]
@@ -361,7 +344,7 @@ mod tests {
         let Keyframe { features, landmarks, .. } = &tracker.map.keyframes[2];
         let sightings = Sightings::new(features, landmarks, &tracker.map, &tracker.rig);
         let bytes = sightings.bytes() as u64;
-        tracker.rig.config.max_host_bytes = 30 * bytes * SHARE_OF_HOST_BYTES;
+        tracker.rig.config.max_host_bytes = 2 * 30 * bytes * SHARE_OF_HOST_BYTES;
         let record = |frame| Record {
             frame_index: 1000 + frame,
             timestamp_s: 0.1,

@@ -9,6 +9,7 @@ mod dense_prior;
 mod frames;
 mod keyframe_selection;
 mod localising;
+mod sightings;
 mod start;
 mod submaps;
 mod velocity;
@@ -19,9 +20,10 @@ use std::time::Instant;
 
 use adjusting::Adjusting;
 use closing::Closing;
-use frames::{Frames, Record, Sightings};
+use frames::{Frames, Record};
 pub use keyframe_selection::is_image_due;
 use localising::FRESHLY_FOUND_FRAMES;
+use sightings::Sightings;
 use velocity::Velocity;
 
 use crate::geometry::{Camera, Se3, StampedPose};

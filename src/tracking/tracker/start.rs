@@ -1,6 +1,7 @@
 //! How a submap begins: with one frame where there is depth, else with two.
 
-use super::frames::{Record, Sightings};
+use super::frames::Record;
+use super::sightings::Sightings;
 use super::{Lostness, Motion, Tracker};
 use crate::geometry::Se3;
 use crate::tracking::front_end::ExtractedFrame;
