@@ -25,7 +25,8 @@ use crate::tracking::solvers::relative_pose::RelativePose;
 const MOST_LINKS: usize = 5;
 /// Keyframes after a frame's reference until the frame's pose is solved again.
 pub const SETTLED_AFTER: usize = 12;
-/// Keyframes after the end of a landmark until its place is used again: later than the frames that saw it are solved again.
+/// Keyframes after the end of a landmark until its place is used again: later than frames without measured depth are solved again. Those that wait
+/// longer name landmarks by [`Map::resolve_since`].
 const REUSED_AFTER: usize = SETTLED_AFTER + 4;
 /// Host memory of a keyframe's feature: itself, its place in the grid, the landmark that it shows, the observation, its entry in the database.
 const BYTES_PER_FEATURE: usize = size_of::<Feature>() + 24 + size_of::<Option<usize>>() + 2 * size_of::<Observation>() + 48;

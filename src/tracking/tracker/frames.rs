@@ -22,7 +22,7 @@ use crate::tracking::{KeyframePose, NewKeyframe};
 const SETTLED_A_FRAME: usize = 2;
 /// Frames that may wait for it: a camera that stands still makes no keyframes.
 const MOST_WAITING: usize = 256;
-/// What frames saw takes at most this share of the tracker's host memory: half of it settled frames, half those that wait for it.
+/// What frames saw takes at most this share of the tracker's host memory: one half for settled frames, one for those that wait.
 const SHARE_OF_HOST_BYTES: u64 = 8;
 /// Share of the landmarks that must still be there, and agree.
 const LEAST_AGREEING: f64 = 0.5;
@@ -42,8 +42,9 @@ pub(super) struct Record {
 /// What is kept of frames between keyframes.
 #[derive(Debug, Default)]
 pub(super) struct Frames {
-    /// Bundle adjustment is over with the landmarks of records before this one, and their bytes as far as they are not settled.
+    /// Bundle adjustment is over with the landmarks of records before this one.
     aged: usize,
+    /// What those of them that are not settled saw, bytes.
     waiting_bytes: usize,
     /// Records before this one have been solved again.
     settled: usize,
