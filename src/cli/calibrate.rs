@@ -108,11 +108,11 @@ pub fn find_camera(
 }
 
 fn describe(found: &SelfCalibration) -> String {
-    let SelfCalibration { camera, focal_sigma, k1_sigma, keyframes, observations, rms_pixels } = found;
+    let SelfCalibration { camera, readout, focal_sigma, k1_sigma, keyframes, observations, rms_pixels } = found;
     let Distortion { k1, k2, p1, p2, .. } = camera.distortion;
     format!(
-        "focal length {:.1} ± {focal_sigma:.1} pixels, k1 {k1:.4} ± {k1_sigma:.4}, k2 {k2:.4}, p1 {p1:.4}, p2 {p2:.4}, from {observations} \
-         observations in {keyframes} keyframes with {rms_pixels:.2} pixels RMS",
+        "focal length {:.1} ± {focal_sigma:.1} pixels, k1 {k1:.4} ± {k1_sigma:.4}, k2 {k2:.4}, p1 {p1:.4}, p2 {p2:.4}, readout {readout:.2} of a \
+         frame's time, from {observations} observations in {keyframes} keyframes with {rms_pixels:.2} pixels RMS",
         camera.pinhole.fx
     )
 }

@@ -1,14 +1,15 @@
 //! The camera of a recording without a calibration, from its own frames: the monocular tracker makes a map with an assumed focal length, bundle
-//! adjustment of that map estimates focal length and distortion, and the next map is made with these; the answer is the mean of several.
+//! adjustment of that map estimates focal length, distortion and the rolling shutter's readout time, and the next map is made with this lens; the
+//! answer is the mean of several.
 //!
 //! The principal point is taken to be the centre of the image, and pixels to be square.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use nalgebra::Vector2;
+use nalgebra::{Vector2, Vector6};
 
-use crate::geometry::{Camera, Distortion, Pinhole};
+use crate::geometry::{Camera, Distortion, Pinhole, Se3, se3};
 use crate::sequence::Sensor;
 use crate::tracking::features::frame_features::{Feature, FrameFeatures};
 use crate::tracking::solvers::intrinsics::{Lens, LensDeviation, LensProblem, PixelObservation};
@@ -28,6 +29,8 @@ const LEAST_KEYFRAMES: usize = 6;
 const MOST_KEYFRAMES: usize = 150;
 /// Landmarks that fewer keyframes see say little.
 const LEAST_VIEWS: usize = 3;
+/// A frame's motion is that between the frames up to so many before and after it.
+const MOTION_FRAMES: usize = 2;
 const STEPS: usize = 40;
 /// Standard deviation of the focal length, as a share of it, up to which it is an answer.
 const MOST_DEVIATION: f64 = 0.03;
@@ -39,6 +42,8 @@ const PLAUSIBLE: std::ops::Range<f64> = 0.35..4.0;
 pub struct SelfCalibration {
     /// The camera.
     pub camera: Camera,
+    /// Time from the first row to the last one, intervals between two frames: about 0 for a global shutter.
+    pub readout: f64,
     /// Standard deviation of the focal length, pixels.
     pub focal_sigma: f64,
     /// Standard deviation of the first distortion term.
@@ -102,11 +107,11 @@ pub fn self_calibrate(
     let side = f64::from(width.max(height));
     let mut least_deviation = f64::INFINITY;
     for assumed in ASSUMED {
-        let mut lens = Lens { focal: assumed * side, distortion: Distortion::default() };
+        let mut lens = Lens { focal: assumed * side, distortion: Distortion::default(), readout: 0.0 };
         let (mut estimates, mut maps): (Vec<Estimate>, usize) = (Vec::new(), 0);
         while let Some(estimate) = adjust(frames, &lens, (width, height), config)? {
-            let Lens { focal, distortion } = estimate.lens;
-            tracing::debug!(focal, ?distortion, deviation = estimate.deviation.focal, "self-calibration");
+            let Lens { focal, distortion, readout } = estimate.lens;
+            tracing::debug!(focal, ?distortion, readout, deviation = estimate.deviation.focal, "self-calibration");
             if !estimate.lens.is_plausible((width, height)) {
                 break;
             }
@@ -145,7 +150,7 @@ fn mean_lens(estimates: &[Estimate]) -> Lens {
         p2: mean(&|lens| lens.distortion.p2),
         k3: 0.0,
     };
-    Lens { focal: mean(&|lens| lens.focal.ln()).exp(), distortion }
+    Lens { focal: mean(&|lens| lens.focal.ln()).exp(), distortion, readout: mean(&|lens| lens.readout) }
 }
 
 /// The mean of the estimates, with their own deviation and the one between them.
@@ -159,6 +164,7 @@ fn combine(estimates: &[Estimate], lens: Lens, (width, height): (u32, u32), conf
     let last = &estimates[estimates.len() - 1];
     SelfCalibration {
         camera: camera(lens, width, height),
+        readout: lens.readout,
         focal_sigma: lens.focal * sigma(&|e| (e.lens.focal / lens.focal).ln(), &|e| e.deviation.focal),
         k1_sigma: sigma(&|e| e.lens.distortion.k1 - lens.distortion.k1, &|e| e.deviation.k1),
         keyframes: last.keyframes,
@@ -204,10 +210,14 @@ fn adjust(
     }
     let place: BTreeMap<usize, usize> = keyframes.iter().enumerate().map(|(i, k)| (*k, i)).collect();
     let recorded: BTreeMap<usize, &ExtractedFrame> = frames.iter().map(|f| (f.index, f)).collect();
+    let trajectory: BTreeMap<usize, Se3> =
+        tracker.trajectory().into_iter().map(|(i, p)| (i, p.world_from_camera.inverse())).collect();
     let centre = Vector2::new(camera.pinhole.cx, camera.pinhole.cy);
     let mut problem = LensProblem {
         lens: *lens,
         poses: keyframes.iter().map(|k| map.keyframes[*k].camera_from_world).collect(),
+        motions: keyframes.iter().map(|k| motion(&trajectory, map.keyframes[*k].frame_index)).collect(),
+        height: height.into(),
         points: Vec::new(),
         observations: Vec::new(),
     };
@@ -237,6 +247,14 @@ fn adjust(
     let Some(deviation) = problem.deviation(STEPS) else { return Ok(None) };
     let (rms, observations) = problem.agreement();
     Ok(Some(Estimate { lens: problem.lens, deviation, keyframes: keyframes.len(), observations, rms }))
+}
+
+/// How camera_from_world changes at a frame from one frame to the next, by the frames around it; 0 without them.
+fn motion(trajectory: &BTreeMap<usize, Se3>, frame: usize) -> Vector6<f64> {
+    let around = frame.saturating_sub(MOTION_FRAMES)..=frame + MOTION_FRAMES;
+    let mut poses = trajectory.range(around);
+    let Some(((first, from), (last, to))) = poses.next().zip(poses.next_back()) else { return Vector6::zeros() };
+    se3::log(&(to * from.inverse())) / (last - first) as f64
 }
 
 /// The frame as a camera with this lens sees it.

@@ -38,20 +38,66 @@ pub struct FrameFeatures {
     pub features: Vec<Feature>,
     columns: usize,
     rows: usize,
-    /// `cells[c]..cells[c + 1]` are the places in `by_cell` of cell `c`'s features.
+    /// `cells[c]..cells[c + 1]` are the places of cell `c`'s features.
     cells: Vec<u32>,
-    /// A search reads them in a row.
-    by_cell: Vec<Place>,
+    places: Places,
     /// Relative standard deviation of depth up to which a measurement makes a point.
     max_depth_error: f64,
 }
 
-/// Where a feature is.
-#[derive(Clone, Copy, Debug, Default)]
-struct Place {
-    pixel: Vector2<f64>,
-    index: u32,
-    octave: u8,
+/// Where features are, in columns: a search compares [`LANES`] of them at a time.
+#[derive(Clone, Debug, Default)]
+struct Places {
+    x: Vec<f32>,
+    y: Vec<f32>,
+    /// The octave above [`INDEX_BITS`] bits of the feature's index.
+    octave_and_index: Vec<u32>,
+}
+
+const INDEX_BITS: u32 = 24;
+const LANES: usize = 8;
+
+impl Places {
+    /// For so many features. Each column has [`LANES`] places more, which are near nothing.
+    fn new(count: usize) -> Self {
+        let length = count + LANES;
+        Self { x: vec![f32::NAN; length], y: vec![f32::NAN; length], octave_and_index: vec![0; length] }
+    }
+
+    fn set(&mut self, place: usize, feature: &Feature, index: u32) {
+        self.x[place] = feature.pixel.x as f32;
+        self.y[place] = feature.pixel.y as f32;
+        self.octave_and_index[place] = u32::from(feature.octave) << INDEX_BITS | index;
+    }
+
+    fn index(&self, place: usize) -> usize {
+        (self.octave_and_index[place] & ((1 << INDEX_BITS) - 1)) as usize
+    }
+
+    /// Which of the [`LANES`] features from a place on are near, the first in the lowest bit.
+    #[inline(always)]
+    fn near(&self, place: usize, near: &Near) -> u32 {
+        let lanes = place..place + LANES;
+        let (x, y, octave) = (&self.x[lanes.clone()], &self.y[lanes.clone()], &self.octave_and_index[lanes]);
+        let mut hits = 0;
+        for lane in 0..LANES {
+            let (dx, dy) = (x[lane] - near.x, y[lane] - near.y);
+            let of_octaves = (octave[lane] >> INDEX_BITS).wrapping_sub(near.finest) <= near.coarser;
+            hits |= u32::from((dx * dx + dy * dy <= near.radius_squared) & of_octaves) << lane;
+        }
+        hits
+    }
+}
+
+/// What a search looks for.
+#[derive(Clone, Copy, Debug)]
+struct Near {
+    x: f32,
+    y: f32,
+    radius_squared: f32,
+    finest: u32,
+    /// Octaves above the finest.
+    coarser: u32,
 }
 
 /// The error up to which a feature's depth makes a point: larger where fewer than [`FEWEST_POINTS`] are certain.
@@ -81,14 +127,14 @@ impl FrameFeatures {
         }
         // Features of one cell stay in their order.
         let mut next = cells.clone();
-        let mut by_cell = vec![Place::default(); features.len()];
+        let mut places = Places::new(features.len());
         for (feature, index) in features.iter().zip(0..) {
             let place = &mut next[cell_of(&feature.pixel)];
-            by_cell[*place as usize] = Place { pixel: feature.pixel, index, octave: feature.octave };
+            places.set(*place as usize, feature, index);
             *place += 1;
         }
         let max_depth_error = max_depth_error(&features);
-        Self { features, columns, rows, cells, by_cell, max_depth_error }
+        Self { features, columns, rows, cells, places, max_depth_error }
     }
 
     pub fn len(&self) -> usize {
@@ -96,17 +142,28 @@ impl FrameFeatures {
     }
 
     /// Calls `visit` with the index of every feature of some octaves within `radius` pixels of `centre`, in a fixed order.
+    #[inline(always)]
     pub fn within(&self, centre: &Vector2<f64>, radius: f64, octaves: &RangeInclusive<u8>, mut visit: impl FnMut(usize)) {
         let (x0, x1) = (cell(centre.x - radius, self.columns), cell(centre.x + radius, self.columns));
         let (y0, y1) = (cell(centre.y - radius, self.rows), cell(centre.y + radius, self.rows));
-        let (finest, coarsest) = (*octaves.start(), *octaves.end());
+        let finest = u32::from(*octaves.start());
+        let near = Near {
+            x: centre.x as f32,
+            y: centre.y as f32,
+            radius_squared: (radius * radius) as f32,
+            finest,
+            coarser: u32::from(*octaves.end()) - finest,
+        };
         for y in y0..=y1 {
-            let span = self.cells[y * self.columns + x0] as usize..self.cells[y * self.columns + x1 + 1] as usize;
-            for place in &self.by_cell[span] {
-                // One branch, which is seldom taken.
-                let of_octaves = (place.octave >= finest) & (place.octave <= coarsest);
-                if of_octaves & ((place.pixel - centre).norm_squared() <= radius * radius) {
-                    visit(place.index as usize);
+            let end = self.cells[y * self.columns + x1 + 1] as usize;
+            for first in (self.cells[y * self.columns + x0] as usize..end).step_by(LANES) {
+                let mut hits = self.places.near(first, &near);
+                if end - first < LANES {
+                    hits &= (1 << (end - first)) - 1;
+                }
+                while hits != 0 {
+                    visit(self.places.index(first + hits.trailing_zeros() as usize));
+                    hits &= hits - 1;
                 }
             }
         }

@@ -7,6 +7,7 @@ use std::f32::consts::TAU;
 use std::ops::RangeInclusive;
 
 use nalgebra::Vector2;
+use pulp::{Arch, Simd};
 
 use crate::tracking::features::descriptor::Descriptor;
 use crate::tracking::features::frame_features::{Feature, FrameFeatures};
@@ -52,13 +53,21 @@ pub struct Match {
 }
 
 /// Matches queries to the features around them that are not `taken`, sorted by query. `taken` may be empty for none.
-pub fn match_by_projection(frame: &FrameFeatures, taken: &[bool], queries: &[Query], rules: &Rules) -> Vec<Match> {
+#[pulp::with_simd(match_by_projection = Arch::new())]
+#[inline(always)]
+pub fn match_by_projection_with<'a, S: Simd>(
+    _: S,
+    frame: &'a FrameFeatures,
+    taken: &'a [bool],
+    queries: &'a [Query],
+    rules: &'a Rules,
+) -> Vec<Match> {
     let mut claims: Vec<Option<Match>> = vec![None; frame.len()];
     for (index, query) in queries.iter().enumerate() {
         let (mut best, mut second) = (None::<(u32, usize, u8)>, None::<(u32, u8)>);
         frame.within(&query.pixel, query.radius, &query.octaves, |i| {
             let feature = &frame.features[i];
-            let off_depth = feature.depth_metres.is_some_and(|d| (1.0 / d - query.inverse_depth).abs() > INVERSE_DEPTH_GATE);
+            let off_depth = feature.depth_metres.is_some_and(|d| (1.0 - d * query.inverse_depth).abs() > d * INVERSE_DEPTH_GATE);
             if taken.get(i).copied().unwrap_or(false) || off_depth {
                 return;
             }

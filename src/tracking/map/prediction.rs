@@ -1,12 +1,12 @@
 //! How a landmark looks from a camera: where it should be seen, how large, and by which descriptor.
 
-use nalgebra::Vector3;
+use nalgebra::{Matrix3, Vector3};
 
 use crate::geometry::Se3;
 use crate::tracking::TrackingConfig;
 use crate::tracking::features::descriptor::{Descriptor, representative};
 use crate::tracking::features::projection::Projection;
-use crate::tracking::map::sparse_map::{LandmarkState, Map};
+use crate::tracking::map::sparse_map::{Keyframe, LandmarkState, Map};
 use crate::tracking::rig::Rig;
 
 /// A landmark is looked for only within 60° of the mean direction from which it was seen.
@@ -15,6 +15,8 @@ const MIN_VIEW_COSINE: f64 = 0.5;
 const RANGE_SLACK: f64 = 1.2;
 /// A landmark's descriptor is chosen among those of its latest observations.
 const DESCRIPTORS_COMPARED: usize = 10;
+/// Landmarks seen together have few anchors: so many are kept by their last digits.
+const ANCHORS_KEPT: usize = 64;
 
 impl Map {
     /// Chooses a landmark's descriptor among its latest observations.
@@ -50,23 +52,30 @@ impl Map {
 
     /// Projections of those landmarks that a camera should see, in their order; a projection's `point` is the landmark.
     pub fn visible(&self, landmarks: impl IntoIterator<Item = usize>, camera_from_world: &Se3, rig: &Rig) -> Vec<Projection> {
-        landmarks.into_iter().filter_map(|landmark| self.predict(landmark, camera_from_world, rig)).collect()
+        let mut anchors = [(usize::MAX, Anchor::default()); ANCHORS_KEPT];
+        let predict = |landmark: usize| {
+            let id = self.landmarks[landmark].anchor;
+            let (kept, anchor) = &mut anchors[id % ANCHORS_KEPT];
+            if *kept != id {
+                (*kept, *anchor) = (id, Anchor::new(&self.keyframes[id], camera_from_world));
+            }
+            self.predict(landmark, anchor, rig)
+        };
+        landmarks.into_iter().filter_map(predict).collect()
     }
 
     /// Where a camera should see a landmark; `None` outside of its image, its range of distances or its viewing directions.
-    fn predict(&self, landmark: usize, camera_from_world: &Se3, rig: &Rig) -> Option<Projection> {
+    fn predict(&self, landmark: usize, anchor: &Anchor, rig: &Rig) -> Option<Projection> {
         let pinhole = &rig.pinhole;
         let l = &self.landmarks[landmark];
-        let anchor = &self.keyframes[l.anchor];
-        let p_in_camera = (camera_from_world * self.position(landmark)).coords;
+        let p_in_camera = anchor.rotation * (l.in_anchor.coords * anchor.unit) + anchor.translation;
         let pixel = pinhole.project(&p_in_camera).filter(|pixel| pinhole.contains(pixel, 0.0))?;
         let distance = p_in_camera.norm();
         let (nearest, furthest) = (l.range.0 * anchor.unit, l.range.1 * anchor.unit);
         if distance < nearest / RANGE_SLACK || distance > furthest * RANGE_SLACK {
             return None;
         }
-        let line_of_sight = camera_from_world.rotation.inverse() * p_in_camera / distance;
-        let view_cosine = line_of_sight.dot(&(anchor.camera_from_world.rotation.inverse() * l.view_direction));
+        let view_cosine = p_in_camera.dot(&(anchor.rotation * l.view_direction)) / distance;
         if view_cosine < MIN_VIEW_COSINE {
             return None;
         }
@@ -82,6 +91,27 @@ impl Map {
     }
 }
 
+/// camera_from_keyframe of a landmark's anchor, as a matrix.
+#[derive(Clone, Copy, Debug, Default)]
+struct Anchor {
+    rotation: Matrix3<f64>,
+    /// Metres.
+    translation: Vector3<f64>,
+    /// Metres a unit of the keyframe's landmarks.
+    unit: f64,
+}
+
+impl Anchor {
+    fn new(keyframe: &Keyframe, camera_from_world: &Se3) -> Self {
+        let camera_from_keyframe = camera_from_world * keyframe.camera_from_world.inverse();
+        Self {
+            rotation: camera_from_keyframe.rotation.to_rotation_matrix().into_inner(),
+            translation: camera_from_keyframe.translation.vector,
+            unit: keyframe.unit,
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -94,7 +124,7 @@ mod tests {
     fn a_landmark_is_predicted_where_and_how_large_it_was_seen() {
         let mut map = map();
         let id = map.add_landmark(at(0, 1), Point3::new(0.0, 0.0, 2.0), &config());
-        let predict = |pose: &Se3| map.predict(id, pose, &Rig::new(PINHOLE, config()));
+        let predict = |pose: &Se3| map.visible([id], pose, &Rig::new(PINHOLE, config())).pop();
         let here = predict(&Se3::identity()).unwrap();
         assert_eq!((here.octave, here.inverse_depth), (0, 0.5));
         assert!((here.pixel - Vector2::new(320.5, 241.0)).norm() < 1e-9);

@@ -29,7 +29,7 @@ pub const SETTLED_AFTER: usize = 12;
 /// longer name landmarks by [`Map::resolve_since`].
 const REUSED_AFTER: usize = SETTLED_AFTER + 4;
 /// Host memory of a keyframe's feature: itself, its place in the grid, the landmark that it shows, the observation, its entry in the database.
-const BYTES_PER_FEATURE: usize = size_of::<Feature>() + 24 + size_of::<Option<usize>>() + 2 * size_of::<Observation>() + 48;
+const BYTES_PER_FEATURE: usize = size_of::<Feature>() + 12 + size_of::<Option<usize>>() + 2 * size_of::<Observation>() + 48;
 const BYTES_PER_LANDMARK: usize = size_of::<Landmark>();
 
 #[derive(Clone, Debug, Default)]

@@ -1,11 +1,12 @@
-//! Bundle adjustment that also estimates the focal length and the distortion of the one camera, two radial and two tangential terms:
-//! Levenberg-Marquardt on pixels as they were recorded, with the points eliminated (Triggs et al., *Bundle adjustment: a modern synthesis*, 2000;
-//! Brown, *Close-range camera calibration*, 1971).
+//! Bundle adjustment that also estimates the focal length and the distortion of the one camera, two radial and two tangential terms, and the readout
+//! time of its rolling shutter: Levenberg-Marquardt on pixels as they were recorded, with the points eliminated (Triggs et al., *Bundle adjustment: a
+//! modern synthesis*, 2000; Brown, *Close-range camera calibration*, 1971; Hedborg et al., *Rolling shutter bundle adjustment*, CVPR 2012).
 //!
 //! For one or two hundred poses: the reduced system is dense. The first pose stays; the scale is free, and damping alone holds it.
 
 use nalgebra::{DMatrix, DVector, Matrix2, Matrix2x3, Matrix2x6, Matrix3, Point3, SMatrix, SVector, Vector2, Vector3, Vector6};
 
+use crate::geometry::se3::skew;
 use crate::geometry::{Distortion, Se3, se3};
 use crate::tracking::solvers::residual::point_by_pose;
 
@@ -23,12 +24,14 @@ pub struct Lens {
     pub focal: f64,
     /// All but k3.
     pub distortion: Distortion,
+    /// Time from the first row to the last one, intervals between two frames; 0 for a global shutter.
+    pub readout: f64,
 }
 
-/// The logarithm of the focal length, k1, k2, p1, p2.
-const TERMS: usize = 5;
-/// Standard deviations of k2, p1 and p2 over usual lenses, for views that say little of them.
-const USUAL: [f64; 3] = [0.3, 0.003, 0.003];
+/// The logarithm of the focal length, k1, k2, p1, p2, and the readout time.
+const TERMS: usize = 6;
+/// Standard deviations of k2, p1, p2 and the readout time over usual cameras, for views that say little of them.
+const USUAL: [f64; 4] = [0.3, 0.003, 0.003, 0.5];
 
 impl Lens {
     /// The recorded pixel, relative to the principal point, of a point in the camera frame.
@@ -40,7 +43,7 @@ impl Lens {
     fn stepped(&self, step: &SVector<f64, TERMS>) -> Self {
         let Distortion { k1, k2, p1, p2, k3 } = self.distortion;
         let distortion = Distortion { k1: k1 + step[1], k2: k2 + step[2], p1: p1 + step[3], p2: p2 + step[4], k3 };
-        Self { focal: self.focal * step[0].exp(), distortion }
+        Self { focal: self.focal * step[0].exp(), distortion, readout: self.readout + step[5] }
     }
 }
 
@@ -58,8 +61,12 @@ pub struct PixelObservation {
 #[derive(Clone, Debug)]
 pub struct LensProblem {
     pub lens: Lens,
-    /// camera_from_world.
+    /// camera_from_world, when the middle row was read.
     pub poses: Vec<Se3>,
+    /// How each pose changes between two frames, as a left perturbation of `camera_from_world`.
+    pub motions: Vec<Vector6<f64>>,
+    /// Rows of an image, pixels.
+    pub height: f64,
     pub points: Vec<Point3<f64>>,
     /// Sorted by point.
     pub observations: Vec<PixelObservation>,
@@ -89,14 +96,26 @@ struct Reduced {
 }
 
 impl LensProblem {
-    fn residual(&self, o: &PixelObservation) -> Option<Vector2<f64>> {
+    /// When an observation's row was read, after the middle one, by readout times.
+    fn row(&self, o: &PixelObservation) -> f64 {
+        o.pixel.y / self.height
+    }
+
+    /// The point in the camera frame when its row was read.
+    fn in_camera(&self, o: &PixelObservation) -> Vector3<f64> {
         let p = (self.poses[o.pose] * self.points[o.point]).coords;
+        p + point_by_pose(&p) * self.motions[o.pose] * (self.lens.readout * self.row(o))
+    }
+
+    fn residual(&self, o: &PixelObservation) -> Option<Vector2<f64>> {
+        let p = self.in_camera(o);
         (p.z > 1e-3).then(|| (self.lens.project(&p) - o.pixel) * o.weight)
     }
 
     fn linearise(&self, o: &PixelObservation) -> Option<Linearised> {
         let pose = &self.poses[o.pose];
-        let p = (pose * self.points[o.point]).coords;
+        let at_middle = (pose * self.points[o.point]).coords;
+        let (p, motion) = (self.in_camera(o), &self.motions[o.pose]);
         let residual = self.residual(o)?;
         let n = p.xy() / p.z;
         let (r2, scale) = (n.norm_squared(), self.lens.focal * o.weight);
@@ -106,16 +125,19 @@ impl LensProblem {
         let tangential = Matrix2::new(2.0 * p1 * n.y + 6.0 * p2 * n.x, mixed, mixed, 6.0 * p1 * n.y + 2.0 * p2 * n.x);
         let by_normalised = Matrix2::identity() * radial + n * n.transpose() * (2.0 * k1 + 4.0 * k2 * r2) + tangential;
         let by_camera_point = by_normalised * Matrix2x3::new(1.0, 0.0, -n.x, 0.0, 1.0, -n.y) * (scale / p.z);
+        let turned = Matrix3::identity() + skew(&motion.fixed_rows::<3>(3).into()) * (self.lens.readout * self.row(o));
+        let by_middle = by_camera_point * turned;
         Some(Linearised {
             residual,
-            by_pose: by_camera_point * point_by_pose(&p),
-            by_point: by_camera_point * pose.rotation.to_rotation_matrix().matrix(),
+            by_pose: by_middle * point_by_pose(&at_middle),
+            by_point: by_middle * pose.rotation.to_rotation_matrix().matrix(),
             by_lens: SMatrix::from_columns(&[
                 self.lens.distortion.distort(&n) * scale,
                 n * (r2 * scale),
                 n * (r2 * r2 * scale),
                 Vector2::new(2.0 * n.x * n.y, r2 + 2.0 * n.y * n.y) * scale,
                 Vector2::new(r2 + 2.0 * n.x * n.x, 2.0 * n.x * n.y) * scale,
+                by_camera_point * point_by_pose(&at_middle) * motion * self.row(o),
             ]),
         })
     }
@@ -127,10 +149,10 @@ impl LensProblem {
         self.observations.iter().map(of).sum::<f64>() + prior
     }
 
-    /// Terms that are about 0 in usual lenses: their place, value and standard deviation.
-    fn priors(&self) -> [(usize, f64, f64); 3] {
+    /// Terms that are about 0 in usual cameras: their place, value and standard deviation.
+    fn priors(&self) -> [(usize, f64, f64); 4] {
         let Distortion { k2, p1, p2, .. } = self.lens.distortion;
-        [(2, k2, USUAL[0]), (3, p1, USUAL[1]), (4, p2, USUAL[2])]
+        [(2, k2, USUAL[0]), (3, p1, USUAL[1]), (4, p2, USUAL[2]), (5, self.lens.readout, USUAL[3])]
     }
 
     /// Root mean square of the whitened residuals below the outlier bound, and the observations below it.
@@ -208,7 +230,9 @@ impl LensProblem {
     /// The lens without the views of some poses.
     fn without(&self, poses: std::ops::Range<usize>, steps: usize) -> Lens {
         let mut rest = self.clone();
-        rest.poses.drain(poses.start..poses.end.min(self.poses.len()));
+        let gone = poses.start..poses.end.min(self.poses.len());
+        rest.poses.drain(gone.clone());
+        rest.motions.drain(gone);
         rest.observations.retain(|o| !poses.contains(&o.pose));
         rest.observations.iter_mut().filter(|o| o.pose >= poses.end).for_each(|o| o.pose -= poses.len());
         rest.drop_seen_twice();

@@ -1,25 +1,35 @@
 use super::*;
 
-/// Cameras on an arc around a box of points, and what they measure.
+const HEIGHT: f64 = 480.0;
+/// Poses between two frames.
+const A_FRAME: f64 = 0.1;
+
+/// Cameras with a rolling shutter on an arc around a box of points, and what they measure.
 fn problem(noise: f64, seed: u64) -> (LensProblem, Lens) {
     let mut random = fastrand::Rng::with_seed(seed);
     let mut uniform = |low: f64, high: f64| low + (high - low) * random.f64();
-    let lens = Lens { focal: 520.0, distortion: Distortion { k1: -0.08, k2: 0.03, p1: 0.002, p2: -0.001, k3: 0.0 } };
+    let lens =
+        Lens { focal: 520.0, distortion: Distortion { k1: -0.08, k2: 0.03, p1: 0.002, p2: -0.001, k3: 0.0 }, readout: 0.6 };
     let points: Vec<Point3<f64>> =
         (0..300).map(|_| Point3::new(uniform(-1.5, 1.5), uniform(-1.2, 1.2), uniform(2.0, 4.5))).collect();
-    let pose = |k: usize| {
-        let t = k as f64 / 11.0;
+    let pose = |k: f64| {
+        let t = k / 11.0;
         se3::exp(&Vector6::new(0.8 * t, 0.1 * (7.0 * t).sin(), 0.2 * t, 0.1 * t, -0.35 * t, 0.1 * (5.0 * t).cos()))
     };
-    let poses: Vec<Se3> = (0..12).map(pose).collect();
+    let poses: Vec<Se3> = (0..12).map(|k| pose(k.into())).collect();
+    let motion = |k: i32| se3::log(&(pose(f64::from(k) + A_FRAME) * pose(k.into()).inverse()));
     let mut observations = Vec::new();
     for (point, position) in points.iter().enumerate() {
-        for (k, pose) in poses.iter().enumerate() {
-            let pixel = lens.project(&(pose * position).coords) + Vector2::new(uniform(-noise, noise), uniform(-noise, noise));
+        for k in 0..poses.len() {
+            // The row that shows the point when it is read.
+            let seen_at = |row: f64| lens.project(&(pose(k as f64 + A_FRAME * lens.readout * row) * position).coords);
+            let pixel = (0..4).fold(seen_at(0.0), |pixel, _| seen_at(pixel.y / HEIGHT));
+            let pixel = pixel + Vector2::new(uniform(-noise, noise), uniform(-noise, noise));
             observations.push(PixelObservation { pose: k, point, pixel, weight: 1.0 });
         }
     }
-    (LensProblem { lens, poses, points, observations }, lens)
+    let motions = (0..12).map(motion).collect();
+    (LensProblem { lens, poses, motions, height: HEIGHT, points, observations }, lens)
 }
 
 #[test]
@@ -57,7 +67,7 @@ fn derivatives_are_the_numerical_ones() {
 fn a_lens_is_found_and_its_deviation_covers_the_error() {
     for (noise, tolerance, seed) in [(0.0, 1e-3, 1), (1.0, 0.02, 2), (1.0, 0.02, 3), (1.0, 0.02, 4), (1.0, 0.02, 5)] {
         let (mut problem, truth) = problem(noise, seed);
-        problem.lens = Lens { focal: 450.0, distortion: Distortion::default() };
+        problem.lens = Lens { focal: 450.0, distortion: Distortion::default(), readout: 0.0 };
         // A wrong pixel or two.
         problem.observations.iter_mut().step_by(150).for_each(|o| o.pixel.x += 60.0);
         problem.solve(40);
@@ -66,6 +76,7 @@ fn a_lens_is_found_and_its_deviation_covers_the_error() {
         let deviation = problem.deviation(40).unwrap();
         let error = (problem.lens.focal / truth.focal - 1.0).abs();
         assert!(error < tolerance && error <= 4.0 * deviation.focal + 1e-5, "{:?} {deviation:?}", problem.lens);
+        assert!((problem.lens.readout - truth.readout).abs() < 0.05 + 0.2 * noise, "{:?}", problem.lens);
         assert!((problem.lens.distortion.k1 - truth.distortion.k1).abs() < 4.0 * deviation.k1 + 1e-4 && deviation.focal < 0.02);
     }
 }
