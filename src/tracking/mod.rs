@@ -8,6 +8,7 @@
 //! mapper or the GPU.
 
 mod adjustment;
+mod allocator;
 mod config;
 mod error;
 pub(crate) mod features;

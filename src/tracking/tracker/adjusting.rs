@@ -11,6 +11,7 @@ use super::{Record, Tracker, milliseconds};
 use crate::geometry::Se3;
 use crate::sequence::Sensor;
 use crate::tracking::adjustment::local_bundle::Adjustment;
+use crate::tracking::allocator;
 use crate::tracking::map::keyframe_culling::{cull_around, thin};
 use crate::tracking::rig::Rig;
 use crate::tracking::solvers::depth_bias::BiasPrior;
@@ -27,6 +28,8 @@ const MOST_AT_THE_END: usize = 2_000_000;
 const BYTES_PER_OBSERVATION: u64 = 450;
 /// Observations of frames between keyframes in that adjustment, at most; more if the keyframes have more.
 const MOST_OF_FRAMES: usize = 150_000;
+/// Keyframes that thinning culls until freed memory goes back to the system.
+const GIVEN_BACK_EVERY: usize = 256;
 
 /// The worker, and what it is at.
 #[derive(Debug)]
@@ -41,8 +44,9 @@ pub(super) struct Adjusting {
     waiting: Option<Waiting>,
     /// Real time: keyframes that came before it and are still to be searched for loops.
     overtaken: Vec<usize>,
-    /// Where thinning goes on.
+    /// Where thinning goes on, and how many keyframes it has culled since freed memory went back to the system.
     thinned: usize,
+    freed: usize,
     /// Frames seen when the whole map was adjusted last.
     all_adjusted_at: usize,
 }
@@ -73,6 +77,7 @@ impl Adjusting {
             waiting: None,
             overtaken: Vec::new(),
             thinned: 0,
+            freed: 0,
             all_adjusted_at: 0,
         }
     }
@@ -247,10 +252,16 @@ impl Tracker {
         if !closed && self.rig.config.keyframe_culling {
             cull_around(&mut self.map, keyframe, |k| self.loops.holds(k), &self.rig.config);
         }
+        let living = self.map.living.len();
         // One more than there are new ones, so that the map gets below its bound.
         for _ in 0..=keyframes.len() {
             let most = self.rig.config.max_host_bytes.saturating_sub(self.frame_bytes());
             self.adjusting.thinned = thin(&mut self.map, most, self.adjusting.thinned, |k| self.loops.holds(k), &self.rig.config);
+        }
+        self.adjusting.freed += living - self.map.living.len();
+        if self.adjusting.freed >= GIVEN_BACK_EVERY {
+            self.adjusting.freed = 0;
+            allocator::give_back_freed();
         }
         self.motion.reference = self.map.living(self.motion.reference);
         times.mapping_ms += milliseconds(clock);
@@ -277,22 +288,33 @@ impl Tracker {
 
     /// A keyframe moved, and lengths around it grew by a factor.
     pub(super) fn note_move(&mut self, keyframe: usize, growth: f64) {
-        *self.moved.entry(keyframe).or_insert(1.0) *= growth;
+        self.moved.push((keyframe, growth));
     }
 
     /// Keyframes that moved since the last call.
     pub(super) fn updates(&mut self) -> Vec<KeyframeUpdate> {
-        let (moved, images) = (std::mem::take(&mut self.moved), self.frames.take_moved());
+        let (mut moved, images) = (std::mem::take(&mut self.moved), self.frames.take_moved());
+        moved.sort_by_key(|(keyframe, _)| *keyframe);
+        moved.dedup_by(|again, first| {
+            let twice = again.0 == first.0;
+            if twice {
+                first.1 *= again.1;
+            }
+            twice
+        });
         let update =
             |id, camera_from_world: Se3, scale| KeyframeUpdate { id, world_from_camera: camera_from_world.inverse(), scale };
         let of_image = |record: &Record, scale| update(record.frame_index, record.pose(&self.map), scale);
-        let mut updates = Vec::new();
+        let mut updates = Vec::with_capacity(moved.len());
         for (k, scale) in &moved {
             let keyframe = &self.map.keyframes[*k];
             updates.push(update(keyframe.frame_index, keyframe.camera_from_world, *scale));
             updates.extend(self.frames.images_of(*k).iter().map(|record| of_image(&self.records[*record], *scale)));
         }
-        let alone = images.iter().map(|record| &self.records[*record]).filter(|record| !moved.contains_key(&record.reference));
+        let alone = images
+            .iter()
+            .map(|record| &self.records[*record])
+            .filter(|record| moved.binary_search_by_key(&record.reference, |m| m.0).is_err());
         updates.extend(alone.map(|record| of_image(record, 1.0)));
         updates.sort_by_key(|update| update.id);
         updates

@@ -14,7 +14,6 @@ mod start;
 mod submaps;
 mod velocity;
 
-use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -70,7 +69,7 @@ pub struct Tracker {
     adjusting: Adjusting,
     closing: Closing,
     /// Keyframes that moved since the last tracked frame, and the factor by which lengths around each have grown.
-    moved: BTreeMap<usize, f64>,
+    moved: Vec<(usize, f64)>,
 }
 
 /// The last pose and the constant-velocity motion model.
@@ -136,7 +135,7 @@ impl Tracker {
             frames: Frames::default(),
             adjusting: Adjusting::new(worker),
             closing: Closing::start(pinhole, steps)?,
-            moved: BTreeMap::new(),
+            moved: Vec::new(),
         })
     }
 
@@ -349,7 +348,7 @@ impl Tracker {
         self.motion.last = Some(LastFrame { features, camera_from_world, landmarks: self.map.keyframes[id].landmarks.clone() });
         self.adjust_around(id, held, times)?;
         // Its pose and its landmarks' depths go out with itself.
-        self.moved.remove(&id);
+        self.moved.retain(|(moved, _)| *moved != id);
         Ok(Some(self.describe(id)))
     }
 
