@@ -11,6 +11,10 @@ use crate::tracking::solvers::residual::Measurement;
 
 /// Side of the search grid's cells, pixels.
 const CELL_PIXELS: f64 = 16.0;
+/// Features that a search compares at a time.
+const LANES: usize = 8;
+/// Low bits of a place's entry that hold the feature's index.
+const INDEX_BITS: u32 = 24;
 /// Relative standard deviation of depth up to which a measurement makes a point, as the weights have it: about three times the real one.
 const CERTAIN_DEPTH: f64 = 0.24;
 /// So many features of a frame make points, the most certain ones, as in ORB-SLAM2,
@@ -45,7 +49,7 @@ pub struct FrameFeatures {
     max_depth_error: f64,
 }
 
-/// Where features are, in columns: a search compares [`LANES`] of them at a time.
+/// Where features are, in columns, so that a search reads [`LANES`] of them in a row.
 #[derive(Clone, Debug, Default)]
 struct Places {
     x: Vec<f32>,
@@ -53,9 +57,6 @@ struct Places {
     /// The octave above [`INDEX_BITS`] bits of the feature's index.
     octave_and_index: Vec<u32>,
 }
-
-const INDEX_BITS: u32 = 24;
-const LANES: usize = 8;
 
 impl Places {
     /// For so many features. Each column has [`LANES`] places more, which are near nothing.
