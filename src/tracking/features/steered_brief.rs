@@ -24,6 +24,12 @@ const MARGIN: i32 = 6;
 /// Side of the patches that the pattern is read from, pixels; their pairs do not touch.
 const TILE: i32 = 48;
 const BITS: usize = 256;
+/// So far from its corner reaches a turned patch, pixels.
+const REACH: i32 = PATCH_RADIUS + MARGIN;
+const PATCH_SIDE: usize = 2 * REACH as usize + 1;
+/// Memory of a row of a patch: with so many rows, a power of two, every place lies inside.
+const PATCH_ROW: usize = PATCH_SIDE.next_power_of_two();
+const PATCH_CENTRE: usize = (PATCH_ROW + 1) * REACH as usize;
 
 /// Pairs of pixels by their places from the corner, columns and rows: the first pixel of each, then the second.
 #[derive(Clone, Debug, PartialEq)]
@@ -54,6 +60,7 @@ impl SmoothedImage {
             BORDER_REFLECT_101,
             Scalar::default(),
         )?;
+        // OpenCV rounds the pixels of a part of an image otherwise than those of a whole one, and its descriptors are of a part.
         imgproc::gaussian_blur(&smoothed.roi(inside)?, &mut middle, Size::new(7, 7), 2.0, 2.0, BORDER_REFLECT_101)?;
         middle.copy_to(&mut smoothed.roi_mut(inside)?)?;
         Ok(Self(smoothed))
@@ -98,17 +105,17 @@ impl SamplingPattern {
         Ok(describe(self, &pixels, corners, angles))
     }
 
-    /// Places of the turned pairs in an image, relative to the corner's.
+    /// Places of the turned pairs in a patch.
     #[inline(always)]
-    fn turned(&self, angle_rad: f32, width: usize) -> [i32; 2 * BITS] {
+    fn turned(&self, angle_rad: f32) -> [u16; 2 * BITS] {
         // A smaller number added to it is rounded to a whole one, halves to even, which the last bits hold.
         const WHOLE: f32 = 12_582_912.0;
-        let ((sin, cos), width) = (angle_rad.sin_cos(), width as f32);
+        let (sin, cos) = angle_rad.sin_cos();
         let mut places = [0; 2 * BITS];
         for (place, (x, y)) in places.iter_mut().zip(self.x.iter().zip(&self.y)) {
             let column = (x * cos - y * sin + WHOLE) - WHOLE;
             let row = (x * sin + y * cos + WHOLE) - WHOLE;
-            *place = (row * width + column + WHOLE).to_bits().wrapping_sub(WHOLE.to_bits()) as i32;
+            *place = (row * PATCH_ROW as f32 + column + (WHOLE + PATCH_CENTRE as f32)).to_bits() as u16;
         }
         places
     }
@@ -124,11 +131,15 @@ fn describe_with<'a, S: Simd>(
     angles: &'a [f32],
 ) -> Vec<Descriptor> {
     let mut descriptors = Vec::with_capacity(corners.len());
+    let mut patch = [0; PATCH_ROW * PATCH_ROW];
     for (corner, angle_rad) in corners.iter().zip(angles) {
-        let centre = (corner.y + MARGIN) * image.width as i32 + corner.x + MARGIN;
+        let first = (corner.y + MARGIN - REACH) as usize * image.width + (corner.x + MARGIN - REACH) as usize;
+        for (row, pixels) in patch.chunks_exact_mut(PATCH_ROW).zip(image.pixels[first..].chunks(image.width)).take(PATCH_SIDE) {
+            row[..PATCH_SIDE].copy_from_slice(&pixels[..PATCH_SIDE]);
+        }
         let mut levels = [0; 2 * BITS];
-        for (level, place) in levels.iter_mut().zip(pattern.turned(*angle_rad, image.width)) {
-            *level = image.pixels[(centre + place) as usize];
+        for (level, place) in levels.iter_mut().zip(pattern.turned(*angle_rad)) {
+            *level = patch[usize::from(place) % patch.len()];
         }
         let (first, second) = levels.split_at(BITS);
         let mut words = [0; BITS / 64];

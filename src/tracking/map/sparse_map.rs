@@ -240,7 +240,8 @@ impl Map {
         }
     }
 
-    /// The living landmark that has become of the one that went by this id when there were `known` keyframes, if any.
+    /// The living landmark that has become of the one that went by this id when there were `known` keyframes, if any. Places are used again in the
+    /// order in which they became free: while the first landmark of a chain keeps its place, so do those into which it was merged.
     pub fn resolve_since(&self, landmark: usize, known: usize) -> Option<usize> {
         if self.landmarks[landmark].first_keyframe < known { self.resolve(landmark) } else { None }
     }
