@@ -24,10 +24,10 @@ const MARGIN: i32 = 6;
 /// Side of the patches that the pattern is read from, pixels; their pairs do not touch.
 const TILE: i32 = 48;
 const BITS: usize = 256;
-/// So far from its corner reaches a turned patch, pixels.
+/// A turned patch reaches this far from its corner, pixels.
 const REACH: i32 = PATCH_RADIUS + MARGIN;
 const PATCH_SIDE: usize = 2 * REACH as usize + 1;
-/// Memory of a row of a patch: with so many rows, a power of two, every place lies inside.
+/// Stride of a patch's rows. A power of two: the remainder that keeps places inside costs one instruction.
 const PATCH_ROW: usize = PATCH_SIDE.next_power_of_two();
 const PATCH_CENTRE: usize = (PATCH_ROW + 1) * REACH as usize;
 
