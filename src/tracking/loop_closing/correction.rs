@@ -46,17 +46,14 @@ pub struct Correction {
 }
 
 impl Correction {
-    /// Spreads the drift that a loop shows over the keyframes since the place; the older ones stay. `edges` are those of all loops, this
-    /// one's the last. The earlier ones hold their keyframes as they are.
+    /// Spreads the drift that a loop shows over its submap; `edges` are those of all loops, this one's the last. The earlier ones hold their keyframes
+    /// as they are.
     pub fn of_loop(map: &Map, found: Recognised, edges: &[Edge], scale_is_free: bool) -> Self {
         let keyframes: Vec<usize> = map.living_in(map.keyframes[found.keyframe].root).collect();
         let before: Vec<Se3> = keyframes.iter().map(|k| map.keyframes[*k].camera_from_world).collect();
         let depth = depth_around(map, found.keyframe);
         let place = |k: usize| keyframes.binary_search(&map.living(k)).ok();
-        // The drift that the loop shows came after the place.
-        let held = place(found.place.min(found.keyframe)).unwrap_or_default();
-        let mut graph =
-            PoseGraph { poses: before.iter().map(|p| Sim3::from(*p)).collect(), edges: Vec::new(), scale_is_free, held };
+        let mut graph = PoseGraph { poses: before.iter().map(|p| Sim3::from(*p)).collect(), edges: Vec::new(), scale_is_free };
         for (a, keyframe) in keyframes.iter().enumerate().skip(1) {
             let mut older: Vec<(usize, usize)> = Vec::new();
             for (other, shared) in &map.keyframes[*keyframe].links {
@@ -77,7 +74,6 @@ impl Correction {
             let a_from_b = if is_new { edge.a_from_b } else { Sim3::from(before[a] * before[b].inverse()) };
             graph.edges.push(Edge { a, b, a_from_b, ..*edge });
         }
-        graph.edges.retain(|edge| edge.a.max(edge.b) > held);
         Self { found, keyframes, before, graph, known: map.keyframes.len() }
     }
 
@@ -103,9 +99,9 @@ impl Correction {
         self.graph.edges.is_empty()
     }
 
-    /// Number of keyframes that the pose graph moves.
+    /// Number of keyframes in the pose graph.
     pub fn size(&self) -> usize {
-        self.keyframes.len().saturating_sub(1 + self.graph.held)
+        self.keyframes.len()
     }
 
     /// Optimises the pose graph.

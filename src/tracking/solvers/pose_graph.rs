@@ -2,7 +2,7 @@
 //! (Grisetti et al., *A tutorial on graph-based SLAM*, 2010; over similarities after Strasdat et al., *Scale drift-aware large scale
 //! monocular SLAM*, RSS 2010).
 //!
-//! One implementation for SE(3) and Sim(3): where the sensor knows the scale, every scale stays as it is. The first poses stay too.
+//! One implementation for SE(3) and Sim(3): where the sensor knows the scale, every scale stays as it is. The first pose stays too.
 //! Knows nothing of the map. Sums run in the order of the edges, and the factorisation is sequential.
 
 use faer::prelude::Solve;
@@ -40,8 +40,6 @@ pub struct PoseGraph {
     pub poses: Vec<Sim3>,
     pub edges: Vec<Edge>,
     pub scale_is_free: bool,
-    /// The poses up to this one stay.
-    pub held: usize,
 }
 
 /// An edge's whitened residual and its derivatives by the poses of a and b.
@@ -112,7 +110,7 @@ impl PoseGraph {
         self.edges.iter().map(|e| e.robust(e.residual(&self.poses[e.a], &self.poses[e.b]).norm_squared()).0).sum()
     }
 
-    /// Unknowns of each pose that moves.
+    /// Unknowns of each pose but the first.
     fn unknowns(&self) -> usize {
         if self.scale_is_free { 7 } else { 6 }
     }
@@ -122,19 +120,19 @@ impl PoseGraph {
     fn normal_equations(&self) -> (Vec<Triplet<usize, usize, f64>>, Vec<f64>) {
         let unknowns = self.unknowns();
         let mut hessian = Vec::with_capacity(self.edges.len() * 3 * unknowns * unknowns);
-        let mut gradient = vec![0.0; unknowns * self.poses.len().saturating_sub(1 + self.held)];
+        let mut gradient = vec![0.0; unknowns * self.poses.len().saturating_sub(1)];
         for edge in &self.edges {
             let Linearised { residual, by_a, by_b } = edge.linearise(&self.poses[edge.a], &self.poses[edge.b]);
             let weight = edge.robust(residual.norm_squared()).1;
             let sides = [(edge.a, by_a), (edge.b, by_b)];
-            for (row_pose, row) in sides.iter().filter(|(pose, _)| *pose > self.held) {
+            for (row_pose, row) in sides.iter().filter(|(pose, _)| *pose > 0) {
                 let slope = row.transpose() * residual * weight;
-                let offset = unknowns * (row_pose - 1 - self.held);
+                let offset = unknowns * (row_pose - 1);
                 (0..unknowns).for_each(|i| gradient[offset + i] += slope[i]);
-                for (column_pose, column) in sides.iter().filter(|(pose, _)| *pose > self.held && pose <= row_pose) {
+                for (column_pose, column) in sides.iter().filter(|(pose, _)| *pose > 0 && pose <= row_pose) {
                     let block = row.transpose() * column * weight;
                     for (i, j) in (0..unknowns).flat_map(|i| (0..unknowns).map(move |j| (i, j))) {
-                        hessian.push(Triplet::new(offset + i, unknowns * (column_pose - 1 - self.held) + j, block[(i, j)]));
+                        hessian.push(Triplet::new(offset + i, unknowns * (column_pose - 1) + j, block[(i, j)]));
                     }
                 }
             }
@@ -144,7 +142,7 @@ impl PoseGraph {
 
     fn take(&mut self, step: &[f64]) {
         let unknowns = self.unknowns();
-        for (pose, step) in self.poses.iter_mut().skip(1 + self.held).zip(step.chunks(unknowns)) {
+        for (pose, step) in self.poses.iter_mut().skip(1).zip(step.chunks(unknowns)) {
             let mut tau = Vector7::zeros();
             tau.iter_mut().zip(step).for_each(|(t, s)| *t = *s);
             *pose = sim3::exp(&tau) * *pose;
@@ -254,22 +252,6 @@ mod tests {
             let again = graph.clone();
             assert!(graph.optimise(5).1 <= last && off_metres(&graph, &truth) <= off_metres(&again, &truth) * 1.01);
         }
-    }
-
-    #[test]
-    fn what_is_held_stays_and_the_rest_moves_as_by_itself() {
-        const HELD: usize = 10;
-        let (mut whole, truth) = drifted(&Sim3::from(se3::exp(&Vector6::new(0.004, -0.002, 0.006, 0.001, 0.004, -0.001))), false);
-        whole.edges.push(edge(HELD, STATIONS - 1, truth[HELD] * truth[STATIONS - 1].inverse()));
-        whole.held = HELD;
-        let moving = whole.edges.iter().filter(|e| e.a.min(e.b) >= HELD);
-        let edges = moving.map(|e| Edge { a: e.a - HELD, b: e.b - HELD, ..*e }).collect();
-        let mut rest = PoseGraph { poses: whole.poses[HELD..].to_vec(), edges, ..Default::default() };
-        let before = whole.poses.clone();
-        whole.edges.retain(|e| e.a.max(e.b) > HELD);
-        assert_eq!(whole.optimise(20), rest.optimise(20));
-        assert_eq!(whole.poses, [&before[..HELD], &rest.poses].concat());
-        assert!(whole.poses[HELD + 1..] != before[HELD + 1..]);
     }
 
     #[test]
